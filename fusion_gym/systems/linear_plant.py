@@ -17,14 +17,14 @@ _CANCELLED = 1e-3  # of what is summed; what is left has lost three digits
 
 
 def covariance_factor(matrix: Array) -> Array:
-    """A factor F of shape (n, rank) with F Fᵀ = matrix, for any positive semi-definite matrix."""
+    """Return a factor F (n, rank) with F Fᵀ = matrix of a positive semi-definite matrix."""
     factor = linalg.root(matrix[..., None])[..., 0]
     return np.ascontiguousarray(factor[:, factor.any(0)])
 
 
 @dataclass(frozen=True)
 class Plant:
-    """What linear plants have in common: A, the noise w ~ N(0, W), the law of x(0).
+    """The common part of linear plants: A, the noise w ~ N(0, W) and the law of x(0).
 
     Shapes: ``transition`` A (n, n, 1), ``process_covariance`` W (n, n, 1), ``process_factor``
     (n, r, 1) with r the rank of W, ``initial_mean`` (n, 1), ``initial_covariance`` (n, n, 1),
@@ -45,7 +45,7 @@ class Plant:
 
     @property
     def noise_channels(self) -> int:
-        """Standard normals that one step consumes: the rank of the process covariance."""
+        """Standard normals per step: the rank of the process covariance."""
         return self.process_factor.shape[1]
 
     def true_radius(self, factor: float) -> float:
@@ -56,7 +56,7 @@ class Plant:
 
     @property
     def unmoved(self) -> tuple[str, ...]:
-        """The options of the true plant that can change nothing."""
+        """Options of the true plant that have no effect."""
         still = np.array_equal(self.transition[..., 0], np.eye(self.size))
         result = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
         return tuple(name for name, absent in result.items() if absent)
@@ -65,8 +65,6 @@ class Plant:
 @dataclass(frozen=True)
 class LinearPlant(Plant):
     """x(t+1) = A x(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
-
-    Build one with :meth:`create`, which checks its arguments.
 
     Source: tobit_token_bucket, equation (1).
     """
@@ -79,11 +77,16 @@ class LinearPlant(Plant):
         initial_mean: ArrayLike,
         initial_covariance: ArrayLike,
     ) -> LinearPlant:
-        """Check the plain matrices (no batch axis) and prepare their factors.
+        """Return a plant from matrices without a batch axis.
+
+        Args:
+            transition: A (n, n).
+            process_covariance: W (n, n), positive semi-definite.
+            initial_mean: mean of x(0) (n,).
+            initial_covariance: covariance of x(0) (n, n), positive semi-definite.
 
         Raises:
-            ConfigurationError: a wrong shape, a non-finite entry, or a covariance that is not
-                symmetric positive semi-definite.
+            ConfigurationError: a wrong shape, a non-finite entry, or no covariance.
         """
         matrix = validation.square("transition", transition)
         size = len(matrix)
@@ -99,13 +102,16 @@ class LinearPlant(Plant):
         )
 
     def start(self, mean: Array, noise: Array) -> Array:
-        """Draw x(0), shape (n, N), about ``mean`` (n, N) from standard normals (n, N)."""
+        """Draw x(0) (n, N) with the mean ``mean`` (n, N) from standard normals (n, N)."""
         return mean + linalg.matvec(self.initial_factor, noise)
 
     def advance(self, state: Array, noise: Array, departure: Array | None = None) -> Array:
-        """x(t+1), shape (n, N), from x(t) (n, N) and standard normals (r, N).
+        """Return x(t+1) (n, N).
 
-        With a ``departure`` (4, N) the plant moves by I + c (A - I) in the place of A.
+        Args:
+            state: x(t) (n, N).
+            noise: standard normals (r, N).
+            departure: (4, N), or None; with it the plant moves by I + c (A - I).
         """
         moved = true_motion(departure, state, linalg.matvec(self.transition, state))
         if not self.noise_channels:
@@ -113,9 +119,13 @@ class LinearPlant(Plant):
         return moved + linalg.matvec(self.process_factor, noise)
 
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.
+        """Return the prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.
 
-        Where A P Aᵀ cancels, as it may after a known start, it is (A F)(A F)ᵀ with a root F of P.
+        Where A P Aᵀ cancels, as after a known start, it is (A F)(A F)ᵀ with a root F of P.
+
+        Args:
+            mean: posterior mean (n, N).
+            covariance: P (n, n, N).
 
         Source: tobit_token_bucket, equations (21) and (29).
         """
@@ -141,19 +151,18 @@ class LinearPlant(Plant):
         return _CANCELLED * self.size * self.transition**2
 
     def open_loop(self, horizon: int) -> Array:
-        """Mean over t = 1..horizon of the error variance without measurements, shape (n,)."""
+        """Return the mean error variance (n,) over t = 1..horizon without measurements."""
         return np.array([np.diagonal(moment) for moment in self.moments(horizon)][1:]).mean(0)
 
     def second_moments(self, horizon: int, random_start: bool = False) -> Array:
-        """Mean square (horizon + 1, n) of each state at t = 0..horizon."""
+        """Return the mean square (horizon + 1, n) of each state at t = 0..horizon."""
         mean, size = self.initial_mean[:, 0], self.size
         start = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
         return np.array([np.diagonal(moment) for moment in self.moments(horizon, start)])
 
     def moments(self, horizon: int, square: float | Array = 0.0) -> Iterator[Array]:
-        """Covariances (n, n) of the error without measurements at t = 0..horizon.
-
-        With the ``square`` (n, n) of the initial mean, the state's second moments.
+        """Yield the error's covariance (n, n) at t = 0..horizon; ``square`` m mᵀ adds the mean's
+        square.
         """
         transition, process = self.transition[..., 0], self.process_covariance[..., 0]
         moment = self.initial_covariance[..., 0] + square
@@ -167,23 +176,28 @@ class LinearPlant(Plant):
 
 
 def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
-    """Root of the mean second moment of each state over t = 0..horizon, shape (n,)."""
+    """Return the root of each state's mean second moment (n,) over t = 0..horizon."""
     magnitude = np.sqrt(plant.second_moments(horizon, random_start).mean(0))
     return np.where(magnitude > 0.0, magnitude, 1.0)
 
 
 def largest_ratio(moments: Array, rows: Array) -> float:
-    """Bound of the mean square of any of the ``rows`` (..., n) of states of ``moments`` (T, n)."""
+    """Return a bound of the mean square of ``rows`` (..., n) of states with ``moments`` (T, n)."""
     finest = np.abs(rows).reshape(-1, rows.shape[-1]).max(0)
     return float((np.sqrt(moments) @ finest).max() ** 2)
 
 
 def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -> float:
-    """Largest ratio of predicted variances, and their rounding, to those that a packet leaves.
+    """Return the largest ratio of predicted variances, with their rounding, to updated variances.
 
-    After silence until one of sixteen times, of packets with ``rows`` C (..., m, n) and ``noise``
-    R (..., m, m). With G = I - K C and P the prediction, state i has (Σ |G_ij| √P_jj)² over the
-    variance that is left.
+    The update follows silence until one of sixteen times. With G = I - K C and the prediction P,
+    the ratio of state i is (Σ |G_ij| √P_jj)² over its updated variance.
+
+    Args:
+        plant: the plant.
+        horizon: steps of an episode.
+        rows: C (..., m, n) of the packets.
+        noise: R (..., m, m) of the packets.
     """
     times = np.geomspace(1, horizon, 16).round()
     largest = 0.0

@@ -1,4 +1,4 @@
-"""The base of a system of one's own: plant, sensors and filter are written, the rest is here."""
+"""Base class of a nonlinear system of your own: you write plant, sensors and filter."""
 
 import functools
 from abc import abstractmethod
@@ -27,7 +27,7 @@ _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clippe
 
 @dataclass(slots=True)
 class FilteredState:
-    """Everything about N runs at one time; n states, l sensors of m channels.
+    """The state of N runs at one time; n states, l sensors of m channels.
 
     ``truth`` (n, N) · ``measurement`` and ``held``, the last delivered one, (l, m, N) · ``age``
     (l, N) · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the
@@ -45,20 +45,20 @@ class FilteredState:
 
 
 class NonlinearSystem(System[FilteredState]):
-    """A plant, its sensors and a filter at the centre, of which four methods are to be written.
+    """A plant with sensors and a filter at the centre, of which you write four methods.
 
     :meth:`move` and :meth:`measure` are the truth, :meth:`predict` and :meth:`update` the filter.
-    The centre takes what was delivered in the order of the sensors. Signals, observation, the
-    error without transmissions (by simulation) and all else of
-    :class:`fusion_gym.core.system.System` follow. All arrays have the batch axis N last.
+    The centre processes deliveries in the order of the sensors. The class derives signals,
+    observation and the simulated error without transmissions. All arrays have the batch axis N
+    last.
 
     Args:
         state_names: a name for each of the n states.
-        sensors: their number l.
-        channels: numbers that each sensor measures, m.
+        sensors: number of sensors l.
+        channels: numbers m that each sensor measures.
         process_channels: standard normals that :meth:`move` consumes.
-        initial_mean: (n,), of the Gaussian from which the truth starts, and the filter with it.
-        initial_covariance: (n, n).
+        initial_mean: mean (n,) of the Gaussian initial state, of truth and filter.
+        initial_covariance: covariance (n, n) of the initial state.
 
     Raises:
         ConfigurationError: a wrong shape, or a covariance that is not positive semi-definite.
@@ -89,21 +89,43 @@ class NonlinearSystem(System[FilteredState]):
 
     @abstractmethod
     def move(self, state: Array, noise: Array) -> Array:
-        """The next true state (n, N) from the present one and standard normals (channels, N)."""
+        """Return the next true state (n, N).
+
+        Args:
+            state: the present true state (n, N).
+            noise: standard normals (process_channels, N).
+        """
 
     @abstractmethod
     def measure(self, state: Array, noise: Array) -> Array:
-        """Measurements (l, m, N) of states (n, N), with standard normals (l, m, N); zeros: none."""
+        """Return the measurements (l, m, N).
+
+        Args:
+            state: true states (n, N).
+            noise: standard normals (l, m, N); zeros give noise-free measurements.
+        """
 
     @abstractmethod
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """The filter's prediction (n, N), (n, n, N) of the next state."""
+        """Return the filter's prediction (n, N), (n, n, N) of the next state.
+
+        Args:
+            mean: posterior mean (n, N).
+            covariance: posterior covariance (n, n, N).
+        """
 
     @abstractmethod
     def update(
         self, mean: Array, covariance: Array, sensor: int, measurement: Array
     ) -> tuple[Array, Array]:
-        """The filter's estimate (n, N), (n, n, N) after a sensor's measurement (m, N)."""
+        """Return the filter's estimate (n, N), (n, n, N) after one measurement.
+
+        Args:
+            mean: prior mean (n, N).
+            covariance: prior covariance (n, n, N).
+            sensor: the sensor's number.
+            measurement: its measurement (m, N).
+        """
 
     @property
     def sensor_count(self) -> int:
@@ -112,12 +134,12 @@ class NonlinearSystem(System[FilteredState]):
 
     @property
     def noise_channels(self) -> int:
-        """Normals of one step: the plant's, then the sensors'."""
+        """Normals of one step: plant, then sensors."""
         return self.process_channels + self.sensor_count * self.channels
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: the state's, then the first measurement's."""
+        """Normals of a start: state, then first measurement."""
         return len(self.state_names) + self.sensor_count * self.channels
 
     @property
@@ -165,7 +187,7 @@ class NonlinearSystem(System[FilteredState]):
         )
 
     def start(self, noise: Array) -> FilteredState:
-        """Time 0: the state is drawn, and every first measurement is known, free of charge."""
+        """Draw the initial state; every first measurement is known without charge."""
         size, runs = len(self.state_names), noise.shape[-1]
         mean = np.repeat(self.initial_mean[:, None], runs, axis=1)
         truth = mean + linalg.root(self.initial_covariance[..., None])[..., 0] @ noise[:size]
@@ -177,7 +199,7 @@ class NonlinearSystem(System[FilteredState]):
         )
 
     def sense(self, state: FilteredState, noise: Array) -> FilteredState:
-        """The plant moves, the sensors measure, the centre predicts."""
+        """Move the plant, measure, and predict."""
         own = self.process_channels
         truth = self.move(state.truth, noise[:own])
         prior_mean, prior_covariance = self.predict(state.mean, state.covariance)
@@ -191,7 +213,7 @@ class NonlinearSystem(System[FilteredState]):
         )
 
     def deliver(self, state: FilteredState, granted: NDArray[np.bool_]) -> FilteredState:
-        """The centre takes in what was granted (l, N), sensor by sensor."""
+        """Update the centre with the granted (l, N) measurements, sensor by sensor."""
         mean, covariance = state.prior_mean, state.prior_covariance
         for sensor in np.flatnonzero(granted.any(1)).tolist():
             first, other = self.update(mean, covariance, sensor, state.measurement[sensor])
@@ -206,7 +228,7 @@ class NonlinearSystem(System[FilteredState]):
         )
 
     def read(self, state: FilteredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals."""
+        """Return the signals."""
         return {
             "measurement": state.measurement,
             "innovation": lambda: state.measurement - self._expected(state),
@@ -221,24 +243,24 @@ class NonlinearSystem(System[FilteredState]):
         }
 
     def visible(self, state: FilteredState) -> FilteredState:
-        """The state without the truth; nothing else is hidden."""
+        """Return the state without the truth."""
         return replace(state, truth=np.full_like(state.truth, np.nan))
 
     @property
     def imagination_channels(self) -> int:
-        """One for each state."""
+        """Number of states."""
         return len(self.state_names)
 
     def imagine(
         self, state: FilteredState, mean: Array, covariance: Array, noise: Array
     ) -> FilteredState:
-        """The state with a truth drawn by what is believed."""
+        """Return the state with a truth drawn from N(mean, covariance)."""
         return replace(state, truth=linalg.draw_normal(mean, covariance, noise))
 
     def adopt(
         self, state: FilteredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]
     ) -> FilteredState:
-        """The centre goes on from this estimate in ``runs`` (N,)."""
+        """Replace the centre's estimate in ``runs`` (N,)."""
         return replace(
             state,
             mean=np.where(runs, mean, state.mean),
@@ -246,14 +268,11 @@ class NonlinearSystem(System[FilteredState]):
         )
 
     def local_means(self, state: FilteredState) -> Array:
-        """The centre's mean for every sensor, (l, n, N): there are no nodes."""
+        """Return the centre's mean for every sensor (l, n, N); the system has no nodes."""
         return np.broadcast_to(state.mean, (self.sensor_count, *state.mean.shape))
 
     def open_loop(self, horizon: int) -> Array:
-        """Mean squared error (n,) over t = 1..horizon of a centre that only predicts.
-
-        Of 1,000 simulated runs, always the same.
-        """
+        """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""
         return self._silence(horizon)[1]
 
     def _measured(self, state: Array, noise: Array) -> Array:
@@ -271,8 +290,7 @@ class NonlinearSystem(System[FilteredState]):
         return self._measured(state.prior_mean, np.zeros(shape))
 
     def _deviation(self, state: FilteredState) -> Array:
-        """The innovation's deviation: by secants one deviation of the prediction to either side,
-        and by the response to one deviation of the noise."""
+        """Return the innovation's deviation, by secants over one deviation of each source."""
         mean = state.prior_mean
         nothing = np.zeros((self.sensor_count * self.channels, mean.shape[-1]))
         variance = (self._measured(mean, nothing + 1.0) - self._measured(mean, nothing)) ** 2

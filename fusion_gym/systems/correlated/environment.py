@@ -30,19 +30,19 @@ _STRUCTURE = Structure(common="all contain the same process noise", prediction=T
 
 @dataclass(frozen=True)
 class CorrelatedTrackingOptions(PaperOptions):
-    """A target's position, velocity and acceleration, each measured by a sensor of its own.
+    """A target whose position, velocity and acceleration are each measured by one sensor.
 
-    Three states driven by one noise, sampled every 0.01. Sensor 0 measures the position, sensor 1
-    the velocity, sensor 2 the acceleration, each with noise of its own plus a multiple of the noise
+    One noise drives the three states, sampled every 0.01. Sensor 0 measures the position, sensor 1
+    the velocity, sensor 2 the acceleration. Each measurement noise contains a multiple of the noise
     that has just moved the target. Filters know only upper bounds of all variances; ``noise_scale``
-    says how far below them the actual ones lie. Each node runs a robust Kalman filter that updates
-    with what the network grants, and the centre fuses its own prediction with the estimates of
-    those nodes, one after another. Nothing is fed back.
+    is the ratio of the actual variances to these bounds. Each node runs a robust Kalman filter on
+    its granted measurements. The centre fuses its own prediction with the estimates of the granted
+    nodes, one after another, without feedback.
 
     Starting state: x₀ ~ N((0.3, 0.1, 0.2), noise_scale · I). The filters know the mean and the
     bound I; nothing has been measured.
 
-    The defaults are the paper's Section 6. Not given in the paper, our choice: ``horizon`` (the
+    The defaults are the paper's Section 6. The paper does not give, and we chose: ``horizon`` (the
     paper runs 600 steps), the token bucket (the paper has none, hence ``tokens="unlimited"``) and
     the reward.
     """
@@ -95,11 +95,7 @@ class CorrelatedTrackingOptions(PaperOptions):
 
 
 def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
-    """The scenario of these options, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
     plant, sensors = _plant_and_sensors(options)
     open_loop = plant.open_loop(horizon)
@@ -132,7 +128,7 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
 def _plant_and_sensors(
     options: CorrelatedTrackingOptions,
 ) -> tuple[LinearPlant, CorrelatedSensors]:
-    """Both on the bounds; the plant's normals are those that the sensors share."""
+    """Return plant and sensors at the bounds; both use the same process normals."""
     size = len(validation.array("transition", options.transition, (None, None)))
     validation.array("transition", options.transition, (size, size))
     gain = validation.array("process_gain", options.process_gain, (size, None))

@@ -1,4 +1,10 @@
-"""Kalman filters for sensors that share a noise with the plant, run on bounds of the variances.
+"""Kalman filters for sensors that share a noise with the plant, at the bounds of the variances.
+
+Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
+based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
+
+Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
+based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
 
 Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
 based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
@@ -19,7 +25,7 @@ from fusion_gym.systems.linear_plant import LinearPlant
 
 
 class RobustOutcomes(NamedTuple):
-    """What a delivery would do at every node; none of it depends on the measurement.
+    """The effect of a delivery at every node, independent of the measurement.
 
     ``gain`` K (sensors, n, m, N); ``innovation_covariance`` (sensors, m, m, N);
     ``delivered_covariance`` (sensors, n, n, N).
@@ -34,10 +40,10 @@ class RobustOutcomes(NamedTuple):
 class RobustKalmanFilter:
     r"""Minimum-variance filter of each node for noises at the bounds of their variances.
 
-    It knows that its measurement noise is correlated with the noise that moved the plant. Without
-    a delivery the posterior is the prior. For smaller actual variances its covariance is an upper
-    bound of the actual one (Theorem 1), whatever is delivered, as long as what is delivered does
-    not depend on the noise.
+    It accounts for the correlation of the measurement noise with the process noise. Without a
+    delivery the posterior is the prior. For smaller actual variances its covariance is an upper
+    bound of the actual one (Theorem 1), for every pattern of deliveries that does not depend on the
+    noise.
 
     Equation:
         $$
@@ -60,13 +66,16 @@ class RobustKalmanFilter:
     sensors: CorrelatedSensors
 
     def expect(self, mean: Array) -> Array:
-        """Expected measurements H x̂ (sensors, m, N) from prior means (sensors, n, N)."""
+        """Return the expected measurements H x̂ (sensors, m, N) of prior means (sensors, n, N)."""
         return linalg.matvec(self.sensors.measurement_matrix, mean)
 
     def innovation_covariance(self, covariance: Array) -> Array:
-        """H P Hᵀ + H S + (H S)ᵀ + R (sensors, m, m, N), P (sensors, n, n, N) or (n, n, N).
+        """Return H P Hᵀ + H S + (H S)ᵀ + R (sensors, m, m, N).
 
-        It holds for any estimate whose prior error contains Γ w, the fused one too.
+        It holds for any estimate whose prior error contains Γ w, including the fused one.
+
+        Args:
+            covariance: P (sensors, n, n, N) or (n, n, N).
         """
         sensors = self.sensors
         matrix = sensors.measurement_matrix
@@ -76,7 +85,7 @@ class RobustKalmanFilter:
         return linalg.congruence(matrix, covariance) + noise
 
     def outcomes(self, covariance: Array) -> RobustOutcomes:
-        """Gains and posterior covariances from prior covariances (sensors, n, n, N).
+        """Return gains and posterior covariances from prior covariances (sensors, n, n, N).
 
         Source: adaptive_innovation, equation (12).
         """
@@ -103,17 +112,18 @@ class RobustKalmanFilter:
 
 @dataclass(frozen=True)
 class JointErrorCovariance:
-    """Actual covariances of the errors of all estimates together, cross-covariances included.
+    """Actual joint covariance of the errors of all estimates.
 
     Estimate 0 is the fused one, estimates 1..l are the nodes'. The joint covariance is an array
     (l + 1, l + 1, n, n, N) of blocks. It is exact for every pattern of deliveries that does not
-    depend on the noise; it contains (23) and (28), and, by applying the fusion's weights to it,
-    (43) and (55) together with the cross-covariances of the fused prediction that these need.
+    depend on the noise. It contains (23) and (28). With the fusion's weights it gives (43) and (55)
+    together with the cross-covariances of the fused prediction in them.
 
     Shapes: ``transition`` (n, n, 1), ``process_covariance`` (n, n, 1), ``initial_covariance``
     (n, n, 1); ``measurement_matrix`` (l + 1, m, n, 1), ``cross_covariance`` (l + 1, n, m, 1) and
     ``covariance`` (l + 1, l + 1, m, m, 1) as in :class:`CorrelatedSensors`, with zeros for the
-    fused estimate, which measures nothing. All are bounds; ``scale`` (N,) makes them actual.
+    fused estimate, which measures nothing. All are bounds; ``scale`` (N,) turns them into actual
+    values.
 
     Source: adaptive_innovation, equations (16), (17), (23), (28), (43), (55).
     """
@@ -127,7 +137,7 @@ class JointErrorCovariance:
 
     @classmethod
     def create(cls, plant: LinearPlant, sensors: CorrelatedSensors) -> JointErrorCovariance:
-        """From the plant and its sensors."""
+        """Return the recursion of a plant and its sensors."""
         ahead = [(1, 0), (0, 0), (0, 0), (0, 0)]
         return cls(
             transition=plant.transition,
@@ -139,19 +149,19 @@ class JointErrorCovariance:
         )
 
     def start(self, scale: Array) -> Array:
-        """At time 0 every estimate is the initial mean: all blocks equal, (l+1, l+1, n, n, N)."""
+        """Return the joint covariance (l+1, l+1, n, n, N) of time 0: all estimates are equal."""
         count = len(self.measurement_matrix)
         actual = scale * self.initial_covariance
         return np.broadcast_to(actual, (count, count, *actual.shape)).copy()
 
     def predict(self, joint: Array, scale: Array) -> Array:
-        """Φ J Φᵀ + scale · Q in every block."""
+        """Return Φ J Φᵀ + scale · Q in every block."""
         moved = linalg.matmul(self.transition, joint)
         moved = linalg.matmul(moved, linalg.transpose(self.transition))
         return moved + scale * self.process_covariance
 
     def update(self, joint: Array, gain: Array, granted: NDArray[np.bool_], scale: Array) -> Array:
-        """The nodes with ``granted`` (l, N) update with their gains (l, n, m, N)."""
+        """Return the joint covariance after granted (l, N) nodes update with gains (l, n, m, N)."""
         used = np.zeros((len(joint), *gain.shape[1:]))
         used[1:] = np.where(granted[:, None, None], gain, 0.0)
         retention = linalg.identity(joint.shape[-2]) - linalg.matmul(used, self.measurement_matrix)
@@ -164,7 +174,7 @@ class JointErrorCovariance:
         return _symmetric(result - crossed - _transposed(crossed) + noise)
 
     def fuse(self, joint: Array, weights: Array) -> Array:
-        """Estimate 0 becomes Σ_j weights_j · estimate j, weights (l + 1, n, n, N) with sum I."""
+        """Return the joint covariance after estimate 0 becomes Σ_j weights_j · estimate j."""
         row = linalg.matmul(weights[:, None], joint).sum(0)
         fused = linalg.matmul(row, linalg.transpose(weights)).sum(0)
         result = joint.copy()

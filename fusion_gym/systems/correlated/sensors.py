@@ -1,4 +1,10 @@
-"""Sensors whose noise contains the very noise that has just moved the plant.
+"""Sensors whose noise contains the process noise of the present step.
+
+Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
+based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
+
+Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
+based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
 
 Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
 based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
@@ -18,13 +24,13 @@ from fusion_gym.systems.linear_plant import LinearPlant
 
 @dataclass(frozen=True)
 class CorrelatedSensors:
-    """y_i = H_i x + η_i + β_i w, where w is the very noise that has just moved the plant.
+    """y_i = H_i x + η_i + β_i w, where w is the noise that has just moved the plant.
 
-    Shapes: ``measurement_matrix`` H (sensors, m, n, 1); ``deviation`` (sensors, m, 1), the bound
-    of the standard deviation of η; ``coupling`` β Q^½ (sensors, m, r, 1), for w written as Q^½
-    times r standard normals. From them follow the bounds ``covariance`` R_ij (sensors, sensors,
-    m, m, 1) between the measurement noises of two sensors and ``cross_covariance`` S_i
-    (sensors, n, m, 1) between Γ w and a measurement noise. Build one with :meth:`create`.
+    Shapes: ``measurement_matrix`` H (sensors, m, n, 1); ``deviation`` (sensors, m, 1), the bound of
+    the standard deviation of η; ``coupling`` β Q^½ (sensors, m, r, 1), for w written as Q^½ times r
+    standard normals. They imply the bounds ``covariance`` R_ij (sensors, sensors, m, m, 1) of two
+    sensors' measurement noises and ``cross_covariance`` S_i (sensors, n, m, 1) of Γ w and a
+    measurement noise.
 
     Source: adaptive_innovation, equations (2), (3), (5), (6).
     """
@@ -44,10 +50,15 @@ class CorrelatedSensors:
         process_deviation: Array,
         plant: LinearPlant,
     ) -> CorrelatedSensors:
-        """Check plain arrays: H (sensors, m, n), variances of η (sensors, m), β (sensors, m, r).
+        """Return sensors from arrays without a batch axis.
 
-        One number for all sensors or one for each will do for the last two. ``process_deviation``
-        (r,) is Q^½, and ``plant.process_factor`` is Γ Q^½.
+        Args:
+            measurement_matrices: H (sensors, m, n).
+            measurement_variance: variances of η (sensors, m), or one number for all or for each
+                sensor.
+            noise_coupling: β (sensors, m, r), or one number for all or for each sensor.
+            process_deviation: Q^½ (r,).
+            plant: the plant, whose ``process_factor`` is Γ Q^½.
 
         Raises:
             ConfigurationError: a wrong shape, a variance <= 0, or an entry that is not finite.
@@ -90,14 +101,17 @@ class CorrelatedSensors:
 
     @property
     def noise_channels(self) -> int:
-        """Standard normals that one measurement of all sensors consumes besides the plant's."""
+        """Standard normals of one measurement of all sensors, without the plant's."""
         return self.count * self.size
 
     def measure(self, state: Array, process_noise: Array, noise: Array) -> Array:
-        """Measurements (sensors, m, N) of the state (n, N) that has just been reached.
+        """Return the measurements (sensors, m, N).
 
-        ``process_noise`` (r, N) are the normals that moved the plant there, ``noise``
-        (sensors·m, N) the sensors' own; both of unit variance for noises at their bounds.
+        Args:
+            state: the present state (n, N).
+            process_noise: the normals (r, N) that moved the plant to it.
+            noise: the sensors' normals (sensors·m, N). Both have unit variance for noises at their
+                bounds.
 
         Source: adaptive_innovation, equations (2) and (3).
         """
@@ -108,7 +122,7 @@ class CorrelatedSensors:
 
 
 def _one_each(value: ArrayLike, sensors: int, missing: int) -> ArrayLike:
-    """One number a sensor as a column that broadcasts over its ``missing`` later axes."""
+    """Return one number per sensor as a column that broadcasts over its ``missing`` later axes."""
     try:
         values = np.asarray(value)
     except ValueError:

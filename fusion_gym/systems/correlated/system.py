@@ -42,15 +42,15 @@ RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
 
 @dataclass(slots=True)
 class CorrelatedTrackingState:
-    """Everything about N runs at one time; n states, l sensors, m components.
+    """The state of N runs at one time; n states, l sensors, m components.
 
-    Estimate 0 is the fused one and estimate i the one of node i. ``truth`` (n, N) · ``scale``
-    (N,), actual variances over their bounds · ``measurement`` (l, m, N) · ``held`` (l, m, N), the
-    last delivered measurement · ``age`` (l, N), steps since then · ``prior_mean`` (l + 1, n, N),
+    Estimate 0 is the fused one and estimate i that of node i. ``truth`` (n, N) · ``scale`` (N,),
+    actual variances over their bounds · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last
+    delivered measurement · ``age`` (l, N), steps since then · ``prior_mean`` (l + 1, n, N),
     ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``outcomes`` at
     the nodes · ``mean`` (l + 1, n, N), ``covariance`` (l + 1, n, n, N), posteriors · ``joint``
-    (l + 1, l + 1, n, n, N), the actual covariances, if they are tracked · ``departure`` (4, N) of
-    the truth from the model, if it departs.
+    (l + 1, l + 1, n, n, N), the actual covariances, if tracked · ``departure`` (4, N) of the truth
+    from the model, if any.
     """
 
     truth: Array
@@ -73,13 +73,13 @@ SIGNALS = common_signals(prior_covariance="conservative covariance of that predi
 
 @dataclass(frozen=True)
 class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
-    """Joins a plant, sensors that share its noise, robust local filters, and a fusion rule.
+    """A plant, sensors that share its noise, robust local filters, and a fusion rule.
 
-    ``plant.process_factor`` is Γ Q^½, so that the plant's normals are the sensors' too.
-    ``noise_scale`` is the ratio of actual variances to bounds, ``None`` draws it for each episode
+    ``plant.process_factor`` is Γ Q^½, so that plant and sensors use the same normals.
+    ``noise_scale`` is the ratio of actual variances to bounds; ``None`` draws it for each episode
     from ``RANDOM_SCALE``. ``state_weights`` (n,) weigh the traces among the signals, ``magnitude``
-    (n,) divides observed estimates and ``reference`` (n,) observed variances. ``joint`` tracks
-    the actual covariances. ``nature`` says how the truth departs from all of this.
+    (n,) divides observed estimates and ``reference`` (n,) observed variances. ``joint`` tracks the
+    actual covariances. ``nature`` is the departure of the truth from this model.
     """
 
     plant: LinearPlant
@@ -102,7 +102,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
 
     @property
     def noise_channels(self) -> int:
-        """Normals of one step: process noise, then the sensors' own."""
+        """Normals of one step: process noise, then the sensors'."""
         return self.plant.noise_channels + self.filter.sensors.noise_channels
 
     @property
@@ -112,7 +112,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
 
     @property
     def covariance_cycle(self) -> int:
-        """1: all covariances follow from the deliveries, by a recursion that never changes."""
+        """1: the recursion of the covariances does not depend on time."""
         return 1
 
     @property
@@ -159,7 +159,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         )
 
     def start(self, noise: Array) -> CorrelatedTrackingState:
-        """Time 0: the state is drawn about the initial mean; nothing has been measured."""
+        """Draw the initial state; nothing has been measured."""
         runs, nodes, n = noise.shape[-1], self.sensor_count, self.plant.size
         noise, departure = self.nature.begin(noise)
         scale = self._scale(noise[-1])
@@ -184,7 +184,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         )
 
     def sense(self, state: CorrelatedTrackingState, noise: Array) -> CorrelatedTrackingState:
-        """The plant moves, the sensors measure with the same noise, all estimates predict.
+        """Move the plant, measure with the same noise, and predict all estimates.
 
         Source: adaptive_innovation, equations (1)-(3), (12), (40), (52).
         """
@@ -210,7 +210,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
     def deliver(
         self, state: CorrelatedTrackingState, granted: NDArray[np.bool_]
     ) -> CorrelatedTrackingState:
-        """Granted nodes update, and the centre fuses its prediction with theirs.
+        """Update the granted nodes, and fuse the centre's prediction with their estimates.
 
         Source: adaptive_innovation, equations (12), (37)-(41) or (47)-(53).
         """
@@ -238,7 +238,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
     def read(
         self, state: CorrelatedTrackingState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals named in ``SIGNALS``."""
+        """Return the signals of ``SIGNALS``."""
         outcomes = sensed(state.outcomes)
         return {
             "measurement": state.measurement,
@@ -256,20 +256,19 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         }
 
     def visible(self, state: CorrelatedTrackingState) -> CorrelatedTrackingState:
-        """The state without truth, actual noise scale, actual covariances and departure."""
+        """Return the state without truth, noise scale, actual covariances and departure."""
         hidden = np.full_like(state.truth, np.nan)
         return replace(state, truth=hidden, scale=hidden[0], joint=None, departure=None)
 
     @property
     def imagination_channels(self) -> int:
-        """One for each state, one for the noise scale."""
+        """Number of states, and one for the noise scale."""
         return self.plant.size + 1
 
     def imagine(
         self, state: CorrelatedTrackingState, mean: Array, covariance: Array, noise: Array
     ) -> CorrelatedTrackingState:
-        """The noise scale is drawn by its law, whatever was measured, the truth from that share of
-        the covariance: it is a bound, and actual covariances are proportional to the scale."""
+        """Draw the noise scale from its law, and the truth from that share of the covariance."""
         scale = self._scale(noise[-1])
         truth = linalg.draw_normal(mean, scale * covariance, noise[:-1])
         return replace(state, truth=truth, scale=scale, departure=None)
@@ -281,48 +280,54 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         covariance: Array,
         runs: NDArray[np.bool_],
     ) -> CorrelatedTrackingState:
-        """The fused estimate goes on from this one in ``runs`` (N,); the nodes' do not."""
+        """Replace the fused estimate in ``runs`` (N,), not the nodes'."""
         means, covariances = state.mean.copy(), state.covariance.copy()
         means[0] = np.where(runs, mean, means[0])
         covariances[0] = np.where(runs, covariance, covariances[0])
         return replace(state, mean=means, covariance=covariances)
 
     def fused(self, state: CorrelatedTrackingState) -> tuple[Array, Array]:
-        """The centre's mean (n, N) and conservative covariance (n, n, N)."""
+        """Return the centre's mean (n, N) and conservative covariance (n, n, N)."""
         return state.mean[0], state.covariance[0]
 
     def local_means(self, state: CorrelatedTrackingState) -> Array:
-        """The nodes' posterior means (sensors, n, N); nothing is fed back to them."""
+        """Return the nodes' posterior means (sensors, n, N)."""
         return state.mean[1:]
 
     def actual_covariance(self, state: CorrelatedTrackingState) -> Array:
-        """Actual covariances (l + 1, l + 1, n, n, N), estimate 0 fused: for the analyst alone.
+        """Return the actual covariances (l + 1, l + 1, n, n, N); estimate 0 is the fused one.
+
+        Args:
+            state: a state after :meth:`deliver`.
 
         Raises:
-            ConfigurationError: they are not tracked.
+            ConfigurationError: the system does not track them.
         """
         if state.joint is None:
             raise refusal("track_actual", False, "True for actual covariances", "here")
         return state.joint
 
     def with_actual_covariance(self) -> CorrelatedTrackingSystem:
-        """The same system with its actual covariances tracked."""
+        """Return the same system with tracked actual covariances."""
         joint = JointErrorCovariance.create(self.plant, self.filter.sensors)
         return replace(self, joint=joint)
 
     def error_covariance(self, state: CorrelatedTrackingState) -> Array:
-        """Actual covariance (n, n, N) of the fused error.
+        """Return the actual covariance (n, n, N) of the fused error.
 
-        Gains and fusion weights come from the bounds, so it is proportional to the noise scale,
-        and the mean over drawn scales is its value at the mean scale: that of a start with zeros.
+        Gains and fusion weights come from the bounds, so it is proportional to the noise scale. A
+        start with zeros has the mean scale, and therefore the mean over drawn scales.
+
+        Args:
+            state: a state after :meth:`deliver`.
 
         Raises:
-            ConfigurationError: it is not tracked.
+            ConfigurationError: the system does not track it.
         """
         return self.actual_covariance(state)[0, 0]
 
     def open_loop(self, horizon: int) -> Array:
-        """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
+        """Return the bound of the mean error variance (n,) of predictions over t = 1..horizon."""
         return self.plant.open_loop(horizon)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
@@ -332,7 +337,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         return largest_ratio(moments, matrix[..., 0] / deviation), 0.0
 
     def _scale(self, noise: Array) -> Array:
-        """Noise scales (N,) from standard normals (N,)."""
+        """Return noise scales (N,) from standard normals (N,)."""
         if self.noise_scale is not None:
             return np.full(noise.shape, self.noise_scale)
         low, high = RANDOM_SCALE

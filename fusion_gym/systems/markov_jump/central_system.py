@@ -1,4 +1,7 @@
-"""The Markov jump plant with a centre that takes the measurements themselves: references.
+"""The Markov jump plant with a centre that receives measurements, as a reference.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements), its plant and sensors; the centre is ours.
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements), its plant and sensors; the centre is ours.
@@ -46,14 +49,14 @@ _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipp
 
 @dataclass(slots=True)
 class MarkovJumpCentralState:
-    """Everything about N runs at one time k; n states, l sensors.
+    """The state of N runs at one time k; n states, l sensors.
 
     ``time`` k (N,) · ``truth`` (n, N), ``mode`` θ (N,), ``process_noise`` w(k) (r, N), which moves
     the plant next · ``measurement`` (l, N), the held value where a sensor does not sample ·
-    ``held`` (l, N), the last delivered measurement · ``age`` (l, N), steps since then ·
-    ``belief`` of the centre, a prior until delivery · ``prediction`` made from that prior ·
-    ``mean`` (n, N), ``covariance`` (n, n, N), the centre's after the delivery ·
-    ``departure`` (4, N) of the truth from the model, if it departs.
+    ``held`` (l, N), the last delivered measurement · ``age`` (l, N), steps since then · ``belief``
+    of the centre, a prior until delivery · ``prediction`` from that prior · ``mean`` (n, N),
+    ``covariance`` (n, n, N), the centre's after the delivery · ``departure`` (4, N) of the truth
+    from the model, if any.
     """
 
     time: Times
@@ -83,14 +86,13 @@ CENTRAL_SIGNALS = (
 
 @dataclass(frozen=True)
 class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
-    """Joins the plant, its sensors and one filter at the centre.
+    """The plant, its sensors and one filter at the centre.
 
     A packet carries the sensor's new measurement. A request of a sensor that does not sample
-    delivers nothing, though the network grants it and takes its tokens. Nothing is fed back.
+    delivers nothing, although the network grants it and takes its tokens. Nothing is fed back.
 
     ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
     estimates, ``reference`` (n,) observed variances and ``scale`` (l,) observed measurements.
-    Build one with :meth:`create`.
     """
 
     plant: MarkovJumpPlant
@@ -117,10 +119,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         horizon: int,
         nature: Nature = AS_ASSUMED,
     ) -> MarkovJumpCentralSystem:
-        """With :class:`InteractingModels` or the linear filter, for ``horizon`` steps.
-
-        Weights of ``None`` make open loop cost one.
-        """
+        """Return the system with :class:`InteractingModels` or the linear filter."""
         common = cls._common_fields(plant, sensors, state_names, state_weights, horizon, nature)
         linear = CentralisedLinearFilter.create(common["model"], horizon)
         estimator = InteractingModels.create(plant, sensors) if interacting else linear
@@ -134,7 +133,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
 
     @property
     def covariance_cycle(self) -> int:
-        """Steps after which the sampling repeats itself."""
+        """Steps after which the sampling repeats."""
         return math.lcm(*self.sensors.period[:, 0].tolist())
 
     @property
@@ -191,7 +190,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         )
 
     def start(self, noise: Array) -> MarkovJumpCentralState:
-        """Time 0: nothing is measured; what is held is what would be expected."""
+        """Draw the initial state; nothing is measured, and the held value is its expectation."""
         runs, n = noise.shape[-1], self.plant.size
         truth, mode, process_noise, departure = self._start(noise)
         belief, time = self.estimator.start(runs), np.zeros(runs, dtype=np.int64)
@@ -213,7 +212,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         )
 
     def sense(self, state: MarkovJumpCentralState, noise: Array) -> MarkovJumpCentralState:
-        """The plant moves and jumps, the sensors measure, the centre predicts.
+        """Move the plant, measure, and predict.
 
         Source: markov_jump, equations (3), (4).
         """
@@ -235,7 +234,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
     def deliver(
         self, state: MarkovJumpCentralState, granted: NDArray[np.bool_]
     ) -> MarkovJumpCentralState:
-        """The centre updates with the samples that were granted, all at once."""
+        """Update the centre with all granted samples at once."""
         sensed(state.prediction)
         taken = granted & self.sensors.sampled(state.time)
         # What is not taken counts for nothing, and may be no number where it is not visible.
@@ -254,7 +253,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
     def read(
         self, state: MarkovJumpCentralState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals named in ``CENTRAL_SIGNALS``."""
+        """Return the signals of ``CENTRAL_SIGNALS``."""
         prediction, n = sensed(state.prediction), self.plant.size
         prior = prediction.covariance[:n, :n]
         return {
@@ -276,7 +275,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         }
 
     def local_means(self, state: MarkovJumpCentralState) -> Array:
-        """The centre's estimate once for each sensor (sensors, n, N): nodes have no filters."""
+        """Return the centre's estimate for each sensor (sensors, n, N); nodes have no filters."""
         return np.repeat(state.mean[None], self.sensor_count, axis=0)
 
     def _whitened(self, state: MarkovJumpCentralState) -> Array:
@@ -295,7 +294,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         return np.sqrt(linalg.diagonal(prediction.covariance)[self.plant.size :])
 
     def _reduction(self, covariance: Array, weights: Array, useful: NDArray[np.bool_]) -> Array:
-        """Fall (l, N) of the weighted trace by each measurement alone, best linear update."""
+        """Return the reduction (l, N) of the weighted trace by each single measurement."""
         n = self.plant.size
         cross = covariance[:n, n:]
         squares = (weights[:, None, None] * cross * cross).sum(0)
@@ -303,7 +302,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         return np.where(useful, squares / np.where(useful, own, 1.0), 0.0)
 
     def _greedy_variance(self, state: MarkovJumpCentralState, prediction: ModePrediction) -> Array:
-        """Samples join one after another, each time the one that lowers the trace most."""
+        """Return the trace as samples join in the order of the largest reduction."""
         n, covariance = self.plant.size, prediction.covariance
         left = self.sensors.sampled(state.time)
         sensors, result = np.arange(self.sensor_count)[:, None], np.zeros(left.shape)
@@ -322,7 +321,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
 
 
 def _measured(linear: CentralisedLinearFilter, horizon: int) -> Array:
-    """Root mean squares (l,) of the sensors' measurements over k = 1..horizon."""
+    """Return root mean squares (l,) of the sensors' measurements over k = 1..horizon."""
     model = linear.model
     sensors, noise = model.sensors, model.plant.noise_covariance
     total = np.zeros(sensors.count)

@@ -1,7 +1,10 @@
-"""Linear-minimum-variance filter of a centre that takes the measurements themselves.
+"""Linear minimum-variance filter of a centre that receives measurements.
 
-Also what it shares with the interacting models: beliefs about state and noise, their update with
-any of the measurements, and what they say of measurements to come.
+It shares with the interacting models the beliefs about state and noise, their update with any of
+the measurements, and the prediction of measurements.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements), for all sensors at once.
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements), for all sensors at once.
@@ -28,7 +31,7 @@ _LONGEST = 2000  # steps after which tables that have not settled end anyway
 
 
 class Belief(NamedTuple):
-    """What the centre believes of the state and of the noise w(k) that moves it next.
+    """The centre's belief about the state and the noise w(k) that moves it next.
 
     One normal distribution of z = col(state, w) for each of M models: ``probability`` (M, N),
     ``mean`` (M, s, N), ``covariance`` (M, s, s, N). In a prediction w has mean 0 and covariance Q
@@ -53,7 +56,7 @@ class ModePrediction(NamedTuple):
 def with_noise(
     probability: Array, mean: Array, covariance: Array, noise_covariance: Array
 ) -> Belief:
-    """A prediction: ``mean`` (M, a, N), ``covariance`` (M, a, a, N) of the state, Q (r, r)."""
+    """Return a prediction from the state's moments (M, a, N), (M, a, a, N) and Q (r, r)."""
     models, size, runs = mean.shape
     whole = size + len(noise_covariance)
     means, spread = np.zeros((models, whole, runs)), np.zeros((models, whole, whole, runs))
@@ -65,10 +68,10 @@ def with_noise(
 def condition_on(
     belief: Belief, rows: Array, variance: Array, measurement: Array, taken: NDArray[np.bool_]
 ) -> tuple[Belief, Array]:
-    """The belief after the measurements that are ``taken``, and their log likelihood by model.
+    """Return the belief after the ``taken`` measurements, and their log likelihood by model.
 
-    Measurement i is ``rows[:, i]`` z plus noise of its own: what the measurement noises share is w,
-    a part of z. So one after another they have the effect of all together.
+    Measurement i is ``rows[:, i]`` z plus independent noise: the measurement noises share only w,
+    which is a part of z. Sequential updates therefore equal a joint one.
 
     Args:
         belief: a prediction.
@@ -76,9 +79,6 @@ def condition_on(
         variance: (M, l, N), of each measurement's own noise, > 0.
         measurement: (l, N).
         taken: (l, N).
-
-    Returns:
-        The belief with the same probabilities, and (M, N) without its constant.
     """
     mean, covariance = belief.mean, belief.covariance
     likelihood = np.zeros(belief.probability.shape)
@@ -96,7 +96,7 @@ def condition_on(
 
 
 def mode_mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
-    """Mean (p, N) and covariance (p, p, N) of maps · z, ``maps`` (M, p, s, 1), over all models."""
+    """Return mean (p, N) and covariance (p, p, N) of maps · z over all models."""
     means = linalg.matvec(maps, belief.mean)
     spreads = linalg.congruence(maps, belief.covariance)
     deviation = np.sqrt(np.maximum(linalg.diagonal(belief.covariance), 0.0))
@@ -111,7 +111,7 @@ def mode_mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
 
 
 def predict_jointly(belief: Belief, maps: Array, variance: Array) -> ModePrediction:
-    """The prediction with ``maps`` (M, n + l, s, 1) and the noises' ``variance`` (M, l, N)."""
+    """Return the prediction with ``maps`` (M, n + l, s, 1) and noise ``variance`` (M, l, N)."""
     mean, covariance = mode_mixture(belief, maps)
     own, sensors = (belief.probability[:, None] * variance).sum(0), variance.shape[1]
     for sensor in range(sensors):
@@ -124,13 +124,13 @@ def predict_jointly(belief: Belief, maps: Array, variance: Array) -> ModePredict
 class CentralisedLinearFilter:
     r"""Best linear filter at the centre, of all delivered measurements.
 
-    The state of the belief is ζ = col(x 1{θ = m}), and there is one model. Covariances depend on
-    time and on what was delivered, not on the data, and are exact.
+    The state of the belief is ζ = col(x 1{θ = m}), and the belief has one model. Covariances depend
+    on time and deliveries, not on the data, and are exact.
 
-    With a = modes · n, s = a + r: ``maps`` (1, n + l, s, 1) from z to col(x, y), with
-    y_i = c_i ζ + α_i w plus own noise · ``motion`` [Ā B̄(k)] (a, s, T) · ``additional`` Q_c(k)
-    (a, a, T) · ``variance`` of the own noises σ_i² C_i P(k) C_iᵀ + R_i (l, T). Tables end when they
-    have settled.
+    With a = modes · n, s = a + r: ``maps`` (1, n + l, s, 1) from z to col(x, y), with y_i = c_i ζ +
+    α_i w plus independent noise · ``motion`` [Ā B̄(k)] (a, s, T) · ``additional`` Q_c(k) (a, a, T)
+    · ``variance`` of the independent noises σ_i² C_i P(k) C_iᵀ + R_i (l, T). Tables end at their
+    steady state.
 
     Equation:
         $$
@@ -167,7 +167,7 @@ class CentralisedLinearFilter:
 
     @classmethod
     def create(cls, model: AugmentedModel, horizon: int) -> CentralisedLinearFilter:
-        """Tables for the times 0..horizon + 1 at least, or until they have settled."""
+        """Return tables for the times 0..horizon + 1 at least, or until their steady state."""
         sensors, n, size = model.sensors, model.plant.size, model.size
         noises = len(model.plant.noise_covariance)
         maps = np.zeros((n + sensors.count, size + noises))
@@ -190,7 +190,7 @@ class CentralisedLinearFilter:
         return cls(model, maps[None, ..., None], motion, additional, variance)
 
     def start(self, runs: int) -> Belief:
-        """Time 0: nothing is measured."""
+        """Return the belief of time 0, without measurements."""
         first = next(self.model.steps())
         covariance = first.moment - np.outer(first.mean, first.mean)
         size = self.model.size
@@ -202,7 +202,7 @@ class CentralisedLinearFilter:
         )
 
     def predict(self, belief: Belief, time: Times) -> Belief:
-        """From after the update at ``time`` (N,) to before the one at ``time`` + 1."""
+        """Return the prediction for ``time`` + 1 from the belief after ``time`` (N,)."""
         place = self._at(time)
         motion = self.motion.take(place, -1)
         covariance = linalg.congruence(motion, belief.covariance[0])
@@ -212,18 +212,18 @@ class CentralisedLinearFilter:
         return with_noise(belief.probability, mean[None], covariance[None], noise)
 
     def prediction(self, belief: Belief, time: Times) -> ModePrediction:
-        """What a prediction for ``time`` (N,) says of the plant and the measurements."""
+        """Return the prediction of plant and measurements for ``time`` (N,)."""
         return predict_jointly(belief, self.maps, self._variance(time))
 
     def update(
         self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
     ) -> Belief:
-        """A prediction for ``time`` after the ``taken`` (l, N) of the measurements (l, N)."""
+        """Return the belief after the ``taken`` (l, N) of the measurements (l, N)."""
         rows = self.maps[:, self.model.plant.size :]
         return condition_on(belief, rows, self._variance(time), measurement, taken)[0]
 
     def estimate(self, belief: Belief) -> tuple[Array, Array]:
-        """Mean (n, N) and covariance (n, n, N) of the plant's state."""
+        """Return mean (n, N) and covariance (n, n, N) of the plant's state."""
         return mode_mixture(belief, self.maps[:, : self.model.plant.size])
 
     def _variance(self, time: Times) -> Array:

@@ -39,27 +39,26 @@ _STRUCTURE = Structure(common="all contain the same process noise", holds=("join
 
 @dataclass(frozen=True)
 class MarkovJumpTrackingOptions(PaperOptions):
-    """A target that jumps between two motions, seen by three fading, asynchronous sensors.
+    """A target that jumps between two motions, measured by three fading, asynchronous sensors.
 
-    Position and velocity follow one of two linear motions, chosen by a Markov chain that nobody
-    sees. Sensor 0 measures at every step, sensor 1 at every second, sensor 2 at every third; a
-    measurement is multiplied by a random number between 0 and 1, and its noise is correlated with
-    the others' and with the noise that moves the target next. Each node runs its own
-    linear-minimum-variance filter at every step, so the link is between node and centre: a packet
-    carries the node's estimate. The centre keeps a copy of each node's estimate, replaces it when a
-    packet arrives, predicts it otherwise, and fuses its copies with matrix weights, knowing the
-    exact joint covariance of their errors. Nothing is fed back.
+    Position and velocity follow one of two linear motions, which a hidden Markov chain selects.
+    Sensor 0 measures at every step, sensor 1 at every second, sensor 2 at every third. A
+    measurement is multiplied by a random number between 0 and 1. Its noise is correlated with the
+    others' and with the noise that moves the target next. Each node runs a linear minimum-variance
+    filter at every step, and a packet carries the node's estimate. The centre keeps a copy of each
+    node's estimate, replaces it when a packet arrives, and predicts it otherwise. It fuses its
+    copies with matrix weights from the exact joint covariance of their errors. Nothing is fed back.
 
     With ``filter="centralised"`` or ``"imm"`` packets carry measurements, and one filter at the
-    centre takes those that are granted: the best linear one, or interacting multiple models. A
-    request of a sensor that does not sample then delivers nothing and costs its tokens all the
-    same. The observation has other entries then: ``print(env.unwrapped.__doc__)`` of such an
-    environment shows them.
+    centre processes the granted ones: the best linear filter, or interacting multiple models. A
+    request of a sensor that does not sample then delivers nothing and still costs its tokens. The
+    observation has other entries: ``print(env.unwrapped.__doc__)`` of such an environment shows
+    them.
 
     Starting state: x₀ ~ N(0, 0.1 I), the mode 1 or 2 with probability 1/2 each. Nodes and centre
     know these distributions; nothing has been measured.
 
-    The defaults are the paper's Section 6. Not given in the paper, our choice: ``horizon``, the
+    The defaults are the paper's Section 6. The paper does not give, and we chose: ``horizon``, the
     token bucket (the paper has none, hence ``tokens="unlimited"``) and the reward.
     """
 
@@ -108,11 +107,7 @@ class MarkovJumpTrackingOptions(PaperOptions):
 
 
 def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
-    """The scenario of these options, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
     plant = MarkovJumpPlant.create(
         options.transitions,
@@ -168,7 +163,7 @@ def _system(
     horizon: int,
     nature: Nature,
 ) -> MarkovJumpSystem | MarkovJumpCentralSystem:
-    """The system of a filter and a fusion rule."""
+    """Return the system of a filter and a fusion rule."""
     names = _state_names(plant.size)
     fusion = _fusion(kind, where, sensors.count)
     if fusion is None:
@@ -179,7 +174,7 @@ def _system(
 
 
 def _fusion(kind: str | None, where: str, sensors: int) -> FusionRule | None:
-    """The rule that joins the nodes' estimates; None where the centre takes the measurements."""
+    """Return the rule that joins the nodes' estimates, or None for a filter at the centre."""
     if where != "local":
         if kind is not None:
             raise ConfigurationError(

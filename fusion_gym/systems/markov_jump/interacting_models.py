@@ -31,12 +31,12 @@ from fusion_gym.systems.markov_jump.sensors import FadingSensors
 class InteractingModels:
     r"""Interacting multiple models at the centre: a Kalman filter and a probability for each mode.
 
-    Model j stands for θ(k) = j; its belief is about z = col(x, w). Since θ(k) governs both the
-    measurement at k and the move to k + 1, beliefs are predicted by their own mode's matrices and
-    mixed afterwards: p(θ(k+1) = m) = Σ_j p_jm p(θ(k) = j), and the belief of m has the first two
-    moments of that mixture. Given the mode, y_i = β̄_i H_ij x + α_i w plus own noise whose variance
-    is R_i + σ_i² E(H_ij x)², by the prediction: fading is taken as noise of that variance, so that
-    neither estimates nor probabilities are exact, and covariances depend on the data.
+    Model j stands for θ(k) = j; its belief is about z = col(x, w). θ(k) governs both the
+    measurement at k and the move to k + 1. Beliefs are therefore predicted by the matrices of their
+    mode and mixed afterwards: p(θ(k+1) = m) = Σ_j p_jm p(θ(k) = j), and the belief of m has the
+    first two moments of that mixture. Given the mode, y_i = β̄_i H_ij x + α_i w plus independent
+    noise of variance R_i + σ_i² E(H_ij x)² under the prediction. Fading acts as noise of that
+    variance, so estimates and probabilities are approximate, and covariances depend on the data.
 
     Shapes, s = n + r: ``maps`` (M, n + l, s, 1) from z to col(x, y), ``motion`` [Φ_j Γ_j]
     (M, n, s, 1), ``unfaded`` H (M, l, n, 1).
@@ -77,7 +77,7 @@ class InteractingModels:
 
     @classmethod
     def create(cls, plant: MarkovJumpPlant, sensors: FadingSensors) -> InteractingModels:
-        """From a plant and its sensors."""
+        """Return the filter of a plant and its sensors."""
         n, count = plant.size, sensors.count
         unfaded = sensors.measurement_matrix.transpose(2, 0, 1)
         maps = np.zeros((plant.modes, n + count, n + len(plant.noise_covariance)))
@@ -94,7 +94,7 @@ class InteractingModels:
         )
 
     def start(self, runs: int) -> Belief:
-        """Time 0: the plant's own distributions; nothing is measured."""
+        """Return the belief of time 0: the plant's own distributions."""
         plant, n = self.plant, self.plant.size
         probability = np.broadcast_to(plant.initial_probabilities[:, None], (plant.modes, runs))
         mean = np.broadcast_to(plant.initial_mean, (plant.modes, n, runs))
@@ -102,7 +102,7 @@ class InteractingModels:
         return with_noise(probability.copy(), mean, covariance, plant.noise_covariance)
 
     def predict(self, belief: Belief, time: Times) -> Belief:
-        """From after the update at ``time`` (N,) to before the one at ``time`` + 1."""
+        """Return the prediction for ``time`` + 1 from the belief after ``time`` (N,)."""
         del time  # the models do not depend on it
         modes, chain = range(self.plant.modes), self.plant.mode_transition
         moved = linalg.matvec(self.motion, belief.mean)
@@ -124,14 +124,14 @@ class InteractingModels:
         return with_noise(probability, mean, covariance, self.plant.noise_covariance)
 
     def prediction(self, belief: Belief, time: Times) -> ModePrediction:
-        """What a prediction for ``time`` (N,) says of the plant and the measurements."""
+        """Return the prediction of plant and measurements for ``time`` (N,)."""
         del time
         return predict_jointly(belief, self.maps, self._variance(belief))
 
     def update(
         self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
     ) -> Belief:
-        """A prediction for ``time`` after the ``taken`` (l, N) of the measurements (l, N)."""
+        """Return the belief after the ``taken`` (l, N) of the measurements (l, N)."""
         del time
         rows, variance = self.maps[:, self.plant.size :], self._variance(belief)
         after, likelihood = condition_on(belief, rows, variance, measurement, taken)
@@ -141,11 +141,11 @@ class InteractingModels:
         return after._replace(probability=weights / weights.sum(0))
 
     def estimate(self, belief: Belief) -> tuple[Array, Array]:
-        """Mean (n, N) and covariance (n, n, N) of the plant's state, over all modes."""
+        """Return mean (n, N) and covariance (n, n, N) of the plant's state, over all modes."""
         return mode_mixture(belief, self.maps[:, : self.plant.size])
 
     def _variance(self, belief: Belief) -> Array:
-        """Variances (M, l, N) of the measurements' own noises, fading included."""
+        """Return variances (M, l, N) of the measurements' independent noises, including fading."""
         n = self.plant.size
         mean, covariance = belief.mean[:, :n], belief.covariance[:, :n, :n]
         second = covariance + linalg.outer(mean, mean)

@@ -2,6 +2,9 @@
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
 """
 
 from __future__ import annotations
@@ -34,12 +37,12 @@ class LagCovariances(NamedTuple):
 
 
 class JointPrediction(NamedTuple):
-    """What may be sent at time k, in the plant's states: covariances after the nodes' update.
+    """Covariances after the nodes' update at time k, before a transmission, in the plant's states.
 
-    ``local`` E L⁺_i L⁺_jᵀ, ``crossed`` E d⁺_i L⁺_jᵀ and ``lag`` E d⁺_i d⁺_jᵀ, each
-    (l, l, n, n, N), with L⁺ the nodes' errors and d⁺ their lags as they are before anything is
-    sent. The copy of a node has the error L⁺_i if it is sent, else L⁺_i + d⁺_i. A variance below
-    ``floor`` (l, n, N) is the rounding of a sum over modes and counts as zero.
+    ``local`` E L⁺_i L⁺_jᵀ, ``crossed`` E d⁺_i L⁺_jᵀ and ``lag`` E d⁺_i d⁺_jᵀ, each (l, l, n, n, N),
+    with L⁺ the nodes' errors and d⁺ their lags before a transmission. The copy of a node has the
+    error L⁺_i after a transmission, else L⁺_i + d⁺_i. A variance below ``floor`` (l, n, N) is the
+    rounding of a sum over modes and counts as zero.
     """
 
     local: Array
@@ -48,7 +51,7 @@ class JointPrediction(NamedTuple):
     floor: Array
 
     def joint(self, sent: NDArray[np.bool_]) -> Array:
-        """Covariance of the copies' errors (l, l, n, n, N) if ``sent`` (l, N) is what is sent."""
+        """Return the covariance of the copies' errors (l, l, n, n, N) after packets (l, N)."""
         behind = 1.0 - sent
         crossed = behind[:, None, None, None] * self.crossed
         result = crossed + crossed.swapaxes(0, 1).swapaxes(2, 3)
@@ -62,19 +65,20 @@ class JointPrediction(NamedTuple):
 
 @dataclass(frozen=True)
 class LagRecursion:
-    """The joint recursion of local and centre errors in the coordinates that make it small.
+    """The joint recursion of the errors of nodes and centre, in the lags.
 
-    The errors of the nodes, L_i, and their covariances depend on time alone. The error of the
+    The errors of the nodes, L_i, and their covariances depend on time only. The error of the
     centre's copy is F_i = L_i + d_i with the lag d_i, the node's estimate minus its copy. A packet
-    makes the lag zero; otherwise d_i' = Ā d_i + u_i ε_i, driven by the node's innovations only:
+    sets the lag to zero; otherwise d_i' = Ā d_i + u_i ε_i, driven by the node's innovations only:
 
-    - E d_i' L_j'ᵀ = s_i [Ā D Āᵀ - Ā y_ij u_jᵀ + u_i E(ε_i L_j')ᵀ], D = E d_i L_jᵀ, y_ij = D c_jᵀ;
-    - E d_i' d_j'ᵀ = s_i s_j [Ā D Āᵀ + Ā y_ij u_jᵀ + u_i (Ā y_ji)ᵀ + u_i u_jᵀ E ε_i ε_j],
-      D = E d_i d_jᵀ,
+    - E d_i' L_j'ᵀ = s_i [Ā D Āᵀ - Ā y_ij u_jᵀ + u_i E(ε_i L_j')ᵀ], D = E d_i L_jᵀ, y_ij = D c_jᵀ; -
+    E d_i' d_j'ᵀ = s_i s_j [Ā D Āᵀ + Ā y_ij u_jᵀ + u_i (Ā y_ji)ᵀ + u_i u_jᵀ E ε_i ε_j],   D = E d_i
+    d_jᵀ,
 
-    with s_i = 0 where node i was sent and 1 elsewhere. E d_i L_iᵀ = 0, for a node's error is
-    orthogonal to all that it measured. The result is the exact (2 l a)² recursion for every pattern
-    of packets that does not depend on the noise; the paper's (46)-(50) hold at full rate only.
+    with s_i = 0 after a transmission of node i and 1 otherwise. E d_i L_iᵀ = 0, because a node's
+    error is orthogonal to its measurements. The result is the exact (2 l a)² recursion for every
+    pattern of packets that does not depend on the noise; the paper's (46)-(50) hold at full rate
+    only.
 
     ``filters`` holds the tables by time; ``states`` is n.
     """
@@ -88,7 +92,7 @@ class LagRecursion:
 
     @classmethod
     def create(cls, filters: LocalFilters, states: int) -> LagRecursion:
-        """From the nodes' tables and the number n of the plant's states."""
+        """Return the recursion of the nodes' tables and the number n of the plant's states."""
         count, size, steps = filters.gain.shape
         modes = size // states
         blocks = filters.covariance.reshape(count, count, modes, states, modes, states, steps)
@@ -110,7 +114,7 @@ class LagRecursion:
         return np.stack([linalg.trace(self.local[node, node]) for node in range(count)])
 
     def start(self, runs: int) -> LagCovariances:
-        """At k = 0 the copies are the nodes' estimates: no lag."""
+        """Return zero lags: at k = 0 the copies are the nodes' estimates."""
         count, size, _ = self.filters.gain.shape
         return LagCovariances(
             np.zeros((count * (count + 1) // 2, size, size, runs)),
@@ -118,7 +122,7 @@ class LagRecursion:
         )
 
     def predict(self, now: LagCovariances, sent: NDArray[np.bool_], place: Times) -> LagCovariances:
-        """From k|k-1 to k+1|k after ``sent`` (l, N), with the ``place`` (N,) of the time k."""
+        """Return the covariances at k+1|k after ``sent`` (l, N), with the ``place`` (N,) of k."""
         filters, silent = self.filters, 1.0 - sent
         count, transition = len(silent), filters.transition
         step = filters.step.take(place, -1)
@@ -147,7 +151,7 @@ class LagRecursion:
         return following
 
     def prediction(self, now: LagCovariances, place: Times) -> JointPrediction:
-        """After the nodes' update at the time with the ``place`` (N,), before anything is sent."""
+        """Return the covariances after the nodes' update at the time with the ``place`` (N,)."""
         filters, n = self.filters, self.states
         count, runs = len(filters.gain), len(place)
         gain = self.gain.take(place, -1)
@@ -185,7 +189,7 @@ def _pairs(count: int) -> list[tuple[int, int]]:
 
 
 def _collapse(rows: Array, states: int) -> Array:
-    """Sum of the modes' parts of the first axis: (modes · n, ...) to (n, ...)."""
+    """Return the sum of the modes' parts of the first axis: (modes · n, ...) to (n, ...)."""
     result = rows[:states].copy()
     for first in range(states, len(rows), states):
         result += rows[first : first + states]

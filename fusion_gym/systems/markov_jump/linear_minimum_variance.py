@@ -1,6 +1,9 @@
-"""Local linear-minimum-variance filters of a Markov jump system whose mode nobody knows.
+"""Local linear minimum-variance filters of a Markov jump system with a hidden mode.
 
-Gains and covariances do not depend on the measurements: they are tables over time, made once.
+Gains and covariances do not depend on the measurements: they are tables over time.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
@@ -30,11 +33,11 @@ ROUNDING = 1e-14  # relative, of a sum over modes
 
 
 class AugmentedStep(NamedTuple):
-    """The augmented model at one time k, plain matrices; a = modes · n.
+    """The augmented model at one time k, without a batch axis; a = modes · n.
 
     ``probabilities`` π(k) (modes,) · ``moment`` P(k) (a, a), block diagonal, the second moment of
     ζ(k) · ``mean`` of ζ(k) (a,) · ``input`` B̄(k) (a, r) · ``additional`` Q_c(k) (a, a), the
-    covariance of what the unknown mode adds between k and k + 1.
+    covariance that the hidden mode adds between k and k + 1.
     """
 
     probabilities: Array
@@ -44,7 +47,7 @@ class AugmentedStep(NamedTuple):
     additional: Array
 
     def moments(self, plant: MarkovJumpPlant) -> tuple[Array, Array]:
-        """Return P(k) and B̄ Q B̄ᵀ (a, a), from which all else of the step follows."""
+        """Return P(k) and B̄ Q B̄ᵀ (a, a), which determine the rest of the step."""
         return self.moment, self.input @ plant.noise_covariance @ self.input.T
 
 
@@ -52,10 +55,10 @@ class AugmentedStep(NamedTuple):
 class AugmentedModel:
     """ζ(k+1) = Ā ζ(k) + B̄(k) w(k) + ξ(k), y_i = c_i ζ + v*_i, with ζ = col(x 1{θ = m}).
 
-    ξ is what the unknown mode adds, of covariance Q_c = P(k+1) - Ā P(k) Āᵀ - B̄ Q B̄ᵀ and
-    uncorrelated with all that came before. v*_i = (β_i - β̄_i) C_i ζ + α_i w + η_i has variance
-    σ_i² C_i P(k) C_iᵀ + α_i Q α_iᵀ + R_i, and Cov(v*_i, v*_j) = α_i Q α_jᵀ. Mode probabilities
-    move with π(k+1) = π(k) p, so that B̄ depends on time.
+    The hidden mode adds ξ, of covariance Q_c = P(k+1) - Ā P(k) Āᵀ - B̄ Q B̄ᵀ and uncorrelated with
+    the past. v*_i = (β_i - β̄_i) C_i ζ + α_i w + η_i has variance σ_i² C_i P(k) C_iᵀ + α_i Q α_iᵀ +
+    R_i, and Cov(v*_i, v*_j) = α_i Q α_jᵀ. Mode probabilities move with π(k+1) = π(k) p, so that B̄
+    depends on time.
 
     Shapes: ``transition`` Ā (a, a), ``faded`` c_i = β̄_i C_i (l, a), ``unfaded`` C_i (l, a).
 
@@ -71,7 +74,7 @@ class AugmentedModel:
 
     @classmethod
     def create(cls, plant: MarkovJumpPlant, sensors: FadingSensors) -> AugmentedModel:
-        """From a plant and its sensors."""
+        """Return the model of a plant and its sensors."""
         chain, phi = plant.mode_transition, plant.transition
         modes = range(plant.modes)
         unfaded = sensors.measurement_matrix.transpose(0, 2, 1).reshape(sensors.count, -1)
@@ -90,12 +93,12 @@ class AugmentedModel:
 
     @property
     def initial_mean(self) -> Array:
-        """Mean of ζ(0), col(π_m μ₀) (a,): what all estimates begin with."""
+        """Mean of ζ(0), col(π_m μ₀) (a,), from which all estimates begin."""
         plant = self.plant
         return np.outer(plant.initial_probabilities, plant.initial_mean[:, 0]).reshape(-1)
 
     def steps(self) -> Iterator[AugmentedStep]:
-        """The model at k = 0, 1, 2, … without end."""
+        """Yield the model at k = 0, 1, 2, … without end."""
         plant = self.plant
         phi, gamma = np.moveaxis(plant.transition, -1, 0), np.moveaxis(plant.process_gain, -1, 0)
         chain, noise = plant.mode_transition, plant.noise_covariance
@@ -115,7 +118,7 @@ class AugmentedModel:
             moments, pi, mean = following, pi @ chain, self.transition @ mean
 
     def state_moments(self, last: int) -> tuple[Array, Array]:
-        """E x and the diagonal of E x xᵀ at k = 0..last, both (last + 1, n)."""
+        """Return E x and the diagonal of E x xᵀ at k = 0..last, both (last + 1, n)."""
         means, squares = [], []
         for _, step in zip(range(last + 1), self.steps(), strict=False):
             means.append(step.mean.reshape(-1, self.plant.size).sum(0))
@@ -123,11 +126,11 @@ class AugmentedModel:
         return np.array(means), np.array(squares)
 
     def open_loop(self, horizon: int) -> Array:
-        """Mean variance (n,) of the state over k = 1..horizon: its error if nothing is known."""
+        """Return the mean variance (n,) of the state over k = 1..horizon."""
         return self.scales(horizon)[0]
 
     def scales(self, horizon: int) -> tuple[Array, Array]:
-        """The mean variance (n,) over k = 1..horizon and the root mean square (n,) with k = 0."""
+        """Return mean variance (n,) over k = 1..horizon and root mean square (n,) with k = 0."""
         means, squares = self.state_moments(horizon)
         variances = squares - means * means
         if (variances < _CANCELLED * squares).any():
@@ -136,7 +139,7 @@ class AugmentedModel:
         return variances[1:].mean(0), np.where(magnitude > 0.0, magnitude, 1.0)
 
     def _variances(self, last: int) -> Array:
-        """The state's variances (last + 1, n) as sums of squares, which cannot cancel."""
+        """Return the state's variances (last + 1, n) as sums of squares, which cannot cancel."""
         plant = self.plant
         phi, gamma = np.moveaxis(plant.transition, -1, 0), np.moveaxis(plant.process_gain, -1, 0)
         chain, pi = plant.mode_transition, plant.initial_probabilities
@@ -168,7 +171,7 @@ def _diagonal_blocks(blocks: Array) -> Array:
 
 
 class FilterUpdate(NamedTuple):
-    """What the nodes make of their measurements.
+    """The nodes' posteriors.
 
     ``mean`` ζ̂(k|k) (l, a, N) · ``noise_mean`` ŵ(k|k) (l, r, N) · ``innovation`` ε (l, N), zero
     where a sensor does not sample.
@@ -183,16 +186,16 @@ class FilterUpdate(NamedTuple):
 class LocalFilters:
     r"""Best linear filters at the nodes, with the joint covariance of their errors.
 
-    Every table has time as its last axis; :meth:`at` turns times into places. A table ends when it
-    has become periodic (to 1e-13), and its last period then stands for all later times.
+    Every table has time as its last axis; :meth:`at` maps times to places. A table ends when it has
+    become periodic (to 1e-13), and its last period then represents all later times.
 
     With l sensors, a = modes · n: ``transition`` Ā (a, a, 1) · ``measurement_matrix`` c (l, a, 1) ·
     ``input`` B̄ (a, r, T) · ``gain`` K (l, a, T) · ``noise_gain`` K_w (l, r, T) ·
-    ``innovation_covariance`` E ε_i ε_j (l, l, T), as if all sampled · ``step`` u_i = Ā K_i + B̄ K_wi
-    (l, a, T), the innovation's part in the next prediction · ``covariance`` E L⁺_i L⁺_jᵀ
+    ``innovation_covariance`` E ε_i ε_j (l, l, T), as if all sampled · ``step`` u_i = Ā K_i + B̄
+    K_wi (l, a, T), the innovation's part in the next prediction · ``covariance`` E L⁺_i L⁺_jᵀ
     (l, l, a, a, T), L⁺ the errors after the update · ``filtered_cross`` E ε_i L⁺_j (l, l, a, T) ·
-    ``predicted_cross`` E ε_i L_j(k+1|k) (l, l, a, T). ``period`` is the number of steps after
-    which the sensors' sampling repeats, at most T.
+    ``predicted_cross`` E ε_i L_j(k+1|k) (l, l, a, T). ``period`` is the number of steps after which
+    the sensors' sampling repeats, at most T.
 
     Equation:
         $$
@@ -235,7 +238,7 @@ class LocalFilters:
 
     @classmethod
     def create(cls, model: AugmentedModel, horizon: int) -> LocalFilters:
-        """Tables for the times 0..horizon + 1 at least, or until they are periodic.
+        """Return tables for the times 0..horizon + 1 at least, or until they are periodic.
 
         At k = 0 nothing is measured, and all nodes hold the mean of ζ(0).
         """
@@ -274,12 +277,12 @@ class LocalFilters:
         return self.gain.shape[-1]
 
     def at(self, time: Times) -> Times:
-        """Places (N,) in the tables of the times (N,)."""
+        """Return the places (N,) of the times (N,) in the tables."""
         beyond = self.length - self.period + (time - self.length) % self.period
         return np.where(time < self.length, time, beyond)
 
     def predict(self, mean: Array, noise_mean: Array, place: Times) -> Array:
-        """ζ̂(k+1|k) = Ā ζ̂(k|k) + B̄ ŵ(k|k), (l, a, N), with ``place`` of the time k.
+        """Return ζ̂(k+1|k) = Ā ζ̂(k|k) + B̄ ŵ(k|k), (l, a, N), with ``place`` of the time k.
 
         Source: markov_jump, equations (16), (36) and, with ŵ = 0, (38).
         """
@@ -289,7 +292,7 @@ class LocalFilters:
     def update(
         self, mean: Array, measurement: Array, sampled: NDArray[np.bool_], place: Times
     ) -> FilterUpdate:
-        """The nodes (l, a, N) take their measurements (l, N) where they are ``sampled`` (l, N).
+        """Return the posteriors after the measurements (l, N) of the ``sampled`` (l, N) sensors.
 
         Source: markov_jump, equations (12), (13), (17).
         """
@@ -314,7 +317,7 @@ class _Row(NamedTuple):
 
 
 def settled(now: tuple[Array, ...], before: tuple[Array, ...]) -> bool:
-    """Whether second moments (a, a) or (l, a, l, a) agree to 1e-13 of their own deviations."""
+    """Return whether second moments (a, a) or (l, a, l, a) agree to 1e-13 of their deviations."""
     for a, b in zip(now, before, strict=True):
         rows = math.isqrt(a.size)
         deviation = np.sqrt(np.abs(np.diagonal(a.reshape(rows, rows))))
@@ -332,11 +335,7 @@ def _advance(
     noise: Array,
     time: int,
 ) -> tuple[_Row, Array]:
-    """One time's row of the tables, and the joint prediction covariance of the next time.
-
-    ``joint`` E L_i L_jᵀ (l, l, a, a) is that of k|k-1, ``shared`` E v*_i wᵀ (l, r), ``noise``
-    E v*_i v*_j without the sensors' own part (l, l).
-    """
+    """Return one time's row of the tables, and the next joint prediction covariance."""
     sensors, transition, faded = model.sensors, model.transition, model.faded
     own = sensors.fading_variance * np.einsum(
         "la,ab,lb->l", model.unfaded, step.moment, model.unfaded
@@ -379,5 +378,5 @@ def _symmetric(blocks: Array) -> Array:
 
 
 def _both_sides(factor: Array, blocks: Array) -> Array:
-    """F_i X_ij F_jᵀ for all pairs: (l, b, a) and (l, l, a, a) to (l, l, b, b)."""
+    """Return F_i X_ij F_jᵀ for all pairs: (l, b, a) and (l, l, a, a) to (l, l, b, b)."""
     return np.asarray(factor[:, None] @ blocks @ factor.swapaxes(1, 2)[None])

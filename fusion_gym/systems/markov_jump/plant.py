@@ -22,7 +22,12 @@ Modes = NDArray[np.int64]
 
 
 def probabilities(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """Entries from 0 to 1 whose last axis adds up to one; made to do so exactly.
+    """Return entries from 0 to 1 whose last axis has the exact sum 1.
+
+    Args:
+        field: the field's name, for errors.
+        value: the entries, with a sum near 1.
+        shape: their shape.
 
     Raises:
         ConfigurationError: a wrong shape, an entry outside [0, 1], or another sum.
@@ -40,9 +45,11 @@ def probabilities(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -
 
 
 def draw_mode(cumulative: Array, noise: Array) -> Modes:
-    """Index (...) of a discrete distribution from standard normals (...).
+    """Return the index (...) that a discrete distribution gives a standard normal.
 
-    ``cumulative`` (values - 1, ...) holds the cumulative probabilities without the last one.
+    Args:
+        cumulative: cumulative probabilities (values - 1, ...), without the last one.
+        noise: standard normals (...).
     """
     return np.asarray((ndtr(noise) > cumulative).sum(0))
 
@@ -52,10 +59,9 @@ class MarkovJumpPlant:
     """x(k+1) = Φ_θ x(k) + Γ_θ w(k) with θ = θ(k) a Markov chain, w ~ N(0, Q).
 
     Shapes, with n states, r noises and M modes: ``transition`` Φ (n, n, M), ``process_gain`` Γ
-    (n, r, M), ``noise_covariance`` Q (r, r), ``noise_factor`` Q^½ (r, r', 1),
-    ``mode_transition`` p (M, M), p[a, b] the probability to go from a to b,
-    ``initial_probabilities`` (M,), ``initial_mean`` μ₀ (n, 1), ``initial_covariance`` P₀
-    (n, n, 1), ``initial_factor`` (n, n, 1). Build one with :meth:`create`.
+    (n, r, M), ``noise_covariance`` Q (r, r), ``noise_factor`` Q^½ (r, r', 1), ``mode_transition`` p
+    (M, M), p[a, b] the probability of a move from a to b, ``initial_probabilities`` (M,),
+    ``initial_mean`` μ₀ (n, 1), ``initial_covariance`` P₀ (n, n, 1), ``initial_factor`` (n, n, 1).
 
     Source: markov_jump, equations (1) and (3), Assumptions 1 to 3.
     """
@@ -81,12 +87,21 @@ class MarkovJumpPlant:
         initial_mean: ArrayLike,
         initial_covariance: ArrayLike,
     ) -> MarkovJumpPlant:
-        """Check plain arrays: Φ (modes, n, n), Γ (modes, n, r), Q (r, r) or a number for r = 1.
+        """Return a plant from arrays without a batch axis.
+
+        Args:
+            transitions: Φ (modes, n, n).
+            process_gains: Γ (modes, n, r).
+            process_covariance: Q (r, r), or a number for r = 1.
+            mode_transition: p (modes, modes).
+            initial_probabilities: (modes,).
+            initial_mean: μ₀ (n,).
+            initial_covariance: P₀ (n, n).
 
         Raises:
-            ConfigurationError: a wrong shape, an entry that is not finite, probabilities that do
-                not add up to one, a covariance that is not positive semi-definite,
-                or a plant that is not mean-square stable.
+            ConfigurationError: a wrong shape, an entry that is not finite, probabilities of another
+                sum, a covariance that is not positive semi-definite, or a plant that is not
+                mean-square stable.
         """
         matrices = validation.array("transitions", transitions, (None, None, None))
         modes, size, _ = matrices.shape
@@ -137,7 +152,7 @@ class MarkovJumpPlant:
         return self.noise_factor.shape[1]
 
     def second_moment_radius(self) -> float:
-        """Spectral radius of the operator [p_nm Φ_n ⊗ Φ_n] that moves the P_m of (10).
+        """Return the spectral radius of the operator [p_nm Φ_n ⊗ Φ_n] that moves the P_m of (10).
 
         The plant is mean-square stable if and only if it is below one.
         """
@@ -149,34 +164,38 @@ class MarkovJumpPlant:
         return float(np.abs(np.linalg.eigvals(operator)).max())
 
     def true_radius(self, factor: float) -> float:
-        """Root of the :meth:`second_moment_radius` with I + c (Φ - I) in the place of each Φ."""
+        """Return the root of the second-moment radius with I + c (Φ - I) in place of each Φ."""
         still = np.eye(self.size)[..., None]
         moved = replace(self, transition=still + factor * (self.transition - still))
         return moved.second_moment_radius() ** 0.5
 
     @property
     def unmoved(self) -> tuple[str, ...]:
-        """The options of the true plant that can change nothing."""
+        """Options of the true plant that have no effect."""
         still = bool((self.transition == np.eye(self.size)[..., None]).all())
         quiet = not (self.noise_factor.any() and self.process_gain.any())
         result = {"true_process_noise": quiet, "true_transition": still}
         return tuple(name for name, absent in result.items() if absent)
 
     def start(self, noise: Array) -> tuple[Array, Modes]:
-        """x(0) (n, N) and θ(0) (N,) from standard normals (n + 1, N), the last one the mode's."""
+        """Return x(0) (n, N) and θ(0) (N,) from standard normals (n + 1, N), the mode's last."""
         state = self.initial_mean + linalg.matvec(self.initial_factor, noise[:-1])
         return state, draw_mode(np.cumsum(self.initial_probabilities)[:-1, None], noise[-1])
 
     def process_noise(self, noise: Array) -> Array:
-        """w (r, N) from standard normals (noise_channels, N)."""
+        """Return w (r, N) from standard normals (noise_channels, N)."""
         return linalg.matvec(self.noise_factor, noise)
 
     def advance(
         self, state: Array, mode: Modes, process_noise: Array, departure: Array | None = None
     ) -> Array:
-        """x(k+1) (n, N) from x(k) (n, N), θ(k) (N,) and w(k) (r, N).
+        """Return x(k+1) (n, N).
 
-        With a ``departure`` (4, N) the plant moves by I + c (Φ_θ - I) in the place of each Φ_θ.
+        Args:
+            state: x(k) (n, N).
+            mode: θ(k) (N,).
+            process_noise: w(k) (r, N).
+            departure: (4, N), or None; with it the plant moves by I + c (Φ_θ - I).
 
         Source: markov_jump, equation (3).
         """
@@ -185,6 +204,6 @@ class MarkovJumpPlant:
         return moved + linalg.matvec(self.process_gain.take(mode, -1), process_noise)
 
     def jump(self, mode: Modes, noise: Array) -> Modes:
-        """θ(k+1) (N,) from θ(k) (N,) and standard normals (N,)."""
+        """Return θ(k+1) (N,) from θ(k) (N,) and standard normals (N,)."""
         cumulative = np.cumsum(self.mode_transition, 1).T[:-1]
         return draw_mode(cumulative.take(mode, -1), noise)

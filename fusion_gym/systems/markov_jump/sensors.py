@@ -1,4 +1,7 @@
-"""Scalar sensors with fading measurements, sampling periods of their own and correlated noises.
+"""Scalar sensors with fading measurements, different sampling periods and correlated noises.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
@@ -22,12 +25,12 @@ class FadingSensors:
     """y_i(k) = β_i(k) H_iθ x(k) + α_i w(k) + η_i(k) at k = n_i, 2 n_i, …; nothing in between.
 
     w(k) is the noise that moves the plant from k to k + 1, so that all measurement noises are
-    correlated with each other and with it. β_i is drawn from a discrete distribution on [0, 1].
+    correlated with each other and with it. β_i has a discrete distribution on [0, 1].
 
     Shapes, with l sensors, n states, r noises, M modes, v values: ``measurement_matrix`` H
     (l, n, M), ``period`` n_i (l, 1) whole numbers, ``fading_values`` (l, v) and
     ``fading_probabilities`` (l, v) of β_i, ``noise_coupling`` α (l, r, 1), ``variance`` of η
-    (l, 1), ``deviation`` its root. Build one with :meth:`create`.
+    (l, 1), ``deviation`` its root.
 
     Source: markov_jump, equations (2) and (4), Section 6 for the noise α_i w + η_i (G = 1).
     """
@@ -51,14 +54,21 @@ class FadingSensors:
         measurement_variance: ArrayLike,
         plant: MarkovJumpPlant,
     ) -> FadingSensors:
-        """Check plain arrays: H (sensors, modes, n), α (sensors,) or (sensors, r).
+        """Return sensors from arrays without a batch axis.
 
-        Periods and variances are one number for all sensors or one for each.
+        Args:
+            measurement_matrices: H (sensors, modes, n).
+            sampling_periods: one number for all sensors or one for each.
+            fading_values: (sensors, values).
+            fading_probabilities: (sensors, values).
+            noise_coupling: α (sensors,) or (sensors, r).
+            measurement_variance: one number for all sensors or one for each.
+            plant: the plant.
 
         Raises:
-            ConfigurationError: a wrong shape, a period that is no whole number >= 1, a fading
-                value outside [0, 1], probabilities that do not add up to one, a variance <= 0, or
-                an entry that is not finite.
+            ConfigurationError: a wrong shape, a period that is no whole number >= 1, a fading value
+                outside [0, 1], probabilities of another sum, a variance <= 0, or an entry that is
+                not finite.
         """
         matrix = validation.array(
             "measurement_matrices", measurement_matrices, (None, plant.modes, plant.size)
@@ -113,20 +123,23 @@ class FadingSensors:
         return np.asarray((deviation**2 * self.fading_probabilities).sum(1))
 
     def sampled(self, time: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which sensors measure at the times (N,) >= 1: (sensors, N), γ of (4)."""
+        """Return γ of (4): which sensors measure at the times (N,) >= 1, (sensors, N)."""
         return np.asarray(time % self.period == 0)
 
     def fading(self, noise: Array) -> Array:
-        """β (sensors, N) from standard normals (sensors, N)."""
+        """Return β (sensors, N) from standard normals (sensors, N)."""
         cumulative = np.cumsum(self.fading_probabilities, 1).T[:-1, :, None]
         place = draw_mode(cumulative, noise)
         return np.asarray(np.take_along_axis(self.fading_values, place, 1))
 
     def measure(self, state: Array, mode: Modes, process_noise: Array, noise: Array) -> Array:
-        """Measurements (sensors, N), as they are if all sensors sample.
+        """Return the measurements (sensors, N) as if all sensors sampled.
 
-        ``state`` (n, N), ``mode`` (N,) and ``process_noise`` w (r, N) are of the same time;
-        ``noise`` (2·sensors, N) are the sensors' normals.
+        Args:
+            state: (n, N).
+            mode: (N,), of the same time.
+            process_noise: w (r, N), of the same time.
+            noise: the sensors' normals (2·sensors, N).
 
         Source: markov_jump, equation (4) with γ = 1.
         """
@@ -138,7 +151,7 @@ class FadingSensors:
 
 
 def _column(value: ArrayLike, sensors: int) -> ArrayLike:
-    """One number a sensor as a column that broadcasts over the noises; all else as it is."""
+    """Return one number per sensor as a column over the noises, other values unchanged."""
     try:
         values = np.asarray(value)
     except ValueError:

@@ -1,4 +1,7 @@
-"""State and signals of the Markov jump system, and the move that its systems share.
+"""State and signals of the Markov jump system, and the motion that its systems share.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
@@ -25,7 +28,7 @@ from fusion_gym.systems.markov_jump.sensors import FadingSensors
 class Motion(NamedTuple):
     """The plant at the next time: ``truth`` (n, N), ``mode`` (N,), ``process_noise`` w (r, N).
 
-    ``measurement`` (l, N) is what all sensors would measure there.
+    ``measurement`` (l, N) holds the measurements of all sensors, sampled or not.
     """
 
     truth: Array
@@ -36,17 +39,16 @@ class Motion(NamedTuple):
 
 @dataclass(slots=True)
 class MarkovJumpState:
-    """Everything about N runs at one time k; n states, a = modes · n, r noises, l sensors.
+    """The state of N runs at one time k; n states, a = modes · n, r noises, l sensors.
 
     ``time`` k (N,) · ``truth`` (n, N), ``mode`` θ (N,), ``process_noise`` w(k) (r, N), which moves
-    the plant next · ``innovation`` ε (l, N), zero where a sensor does not sample ·
-    ``node_mean`` ζ̂(k|k) (l, a, N), ``node_noise`` ŵ (l, r, N), the nodes' ·
-    ``copy_mean`` (l, a, N), ``copy_noise`` (l, r, N), the centre's: a prediction until delivery ·
-    ``held`` (l, n, N), the last delivered estimates · ``age`` (l, N), steps since then ·
-    ``sent`` (l, N) bool, the last deliveries · ``lags`` and ``prediction``, covariances ·
-    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), fused if nobody transmits ·
-    ``mean`` (n, N), ``covariance`` (n, n, N), fused after the delivery · ``departure`` (4, N) of
-    the truth from the model, if it departs.
+    the plant next · ``innovation`` ε (l, N), zero where a sensor does not sample · ``node_mean``
+    ζ̂(k|k) (l, a, N), ``node_noise`` ŵ (l, r, N), the nodes' · ``copy_mean`` (l, a, N),
+    ``copy_noise`` (l, r, N), the centre's: a prediction until delivery · ``held`` (l, n, N), the
+    last delivered estimates · ``age`` (l, N), steps since then · ``sent`` (l, N) bool, the last
+    deliveries · ``lags`` and ``prediction``, covariances · ``prior_mean`` (n, N),
+    ``prior_covariance`` (n, n, N), fused without a transmission · ``mean`` (n, N), ``covariance``
+    (n, n, N), fused after the delivery · ``departure`` (4, N) of the truth from the model, if any.
     """
 
     time: Times
@@ -97,7 +99,7 @@ SIGNALS = (
 
 
 def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
-    """Blocks of the observation that tell where in their sampling the sensors are."""
+    """Return the blocks of the observation with the sensors' sampling phases."""
     own = partial(Block, labels=(numbered(sensors.count),), node="own")
     since = "steps since the sensor's last sampling time over its period"
     return (
@@ -114,7 +116,7 @@ AnyState = TypeVar("AnyState", bound=Any)
 
 
 class MarkovJumpFamily(System[AnyState]):
-    """What the systems of the Markov jump plant have in common."""
+    """The common part of the systems of the Markov jump plant."""
 
     plant: MarkovJumpPlant
     sensors: FadingSensors
@@ -129,7 +131,7 @@ class MarkovJumpFamily(System[AnyState]):
         horizon: int,
         nature: Nature,
     ) -> dict[str, Any]:
-        """Return the fields that both systems have; weights of ``None`` make open loop cost one."""
+        """Return the common fields; weights of ``None`` set the open-loop cost to one."""
         model = AugmentedModel.create(plant, sensors)
         reference, magnitude = model.scales(horizon)
         equal = equal_weights(reference)
@@ -151,16 +153,16 @@ class MarkovJumpFamily(System[AnyState]):
 
     @property
     def noise_channels(self) -> int:
-        """Normals of one step: process noise, the mode, the sensors'."""
+        """Normals of one step: process noise, mode, sensors."""
         return self.plant.noise_channels + 1 + self.sensors.noise_channels
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: the state, the mode, the first process noise, nature's."""
+        """Normals of a start: state, mode, first process noise, nature's."""
         return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
 
     def _start(self, noise: Array) -> tuple[Array, Modes, Array, Array | None]:
-        """The truth (n, N), mode (N,) and process noise (r, N) of time 0, and the departure."""
+        """Return truth (n, N), mode (N,) and process noise (r, N) of time 0, and the departure."""
         noise, departure = self.nature.begin(noise)
         first = self.plant.size + 1
         truth, mode = self.plant.start(noise[:first])
@@ -168,10 +170,10 @@ class MarkovJumpFamily(System[AnyState]):
         return truth, mode, self.plant.process_noise(process), departure
 
     def _move(self, state: AnyState, noise: Array) -> Motion:
-        """The plant moves and jumps, the sensors measure.
+        """Move the plant, and measure with all sensors.
 
-        ``noise`` (channels, N) holds the normals of the process noise, the mode, the sensors; the
-        state's process noise is as it really is, and so is what is returned.
+        ``noise`` (channels, N) holds the normals of process noise, mode and sensors. The state's
+        process noise is the actual one.
 
         Source: markov_jump, equations (3), (4).
         """
@@ -196,13 +198,13 @@ class MarkovJumpFamily(System[AnyState]):
 
     @property
     def imagination_channels(self) -> int:
-        """Normals of the truth, the mode and the process noise."""
+        """Normals of truth, mode and process noise."""
         return self.plant.size + 1 + self.plant.noise_channels
 
     def imagine(self, state: AnyState, mean: Array, covariance: Array, noise: Array) -> AnyState:
-        """Draw the truth by the belief, the mode by the chain's own law at that time.
+        """Draw the truth from N(mean, covariance), the mode and the process noise from their laws.
 
-        The process noise follows its own law; the measurements are not used for it.
+        The draws of mode and process noise do not use the measurements.
         """
         plant, n = self.plant, self.plant.size
         law = np.empty((plant.modes, len(state.time)))

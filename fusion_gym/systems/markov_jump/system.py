@@ -1,4 +1,7 @@
-"""Markov jump plant, nodes that filter, a link from node to centre, fusion of the centre's copies.
+"""Markov jump plant, nodes with filters, a link from node to centre, fusion of the centre's copies.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
@@ -35,10 +38,10 @@ _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero rig
 
 @dataclass(frozen=True)
 class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
-    """Joins the plant, its sensors, the nodes' filters, the joint recursion and a fusion rule.
+    """The plant, its sensors, the nodes' filters, the joint recursion and a fusion rule.
 
     ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
-    estimates and ``reference`` (n,) observed variances. Build one with :meth:`create`.
+    estimates and ``reference`` (n,) observed variances.
     """
 
     plant: MarkovJumpPlant
@@ -66,7 +69,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         horizon: int,
         nature: Nature = AS_ASSUMED,
     ) -> MarkovJumpSystem:
-        """Tables for ``horizon`` steps; weights of ``None`` make open loop cost one."""
+        """Return the system with tables for ``horizon`` steps."""
         common = cls._common_fields(plant, sensors, state_names, state_weights, horizon, nature)
         filters = LocalFilters.create(common["model"], horizon)
         recursion = LagRecursion.create(filters, plant.size)
@@ -74,7 +77,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
 
     @property
     def covariance_cycle(self) -> int:
-        """Steps after which the sampling repeats itself; covariances depend on no data."""
+        """Steps after which the sampling repeats; covariances do not depend on the data."""
         return self.filters.period
 
     @property
@@ -122,7 +125,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         )
 
     def start(self, noise: Array) -> MarkovJumpState:
-        """Time 0: all estimates are the mean of ζ(0); nothing is measured, nothing lags behind."""
+        """Draw the initial state; all estimates are the mean of ζ(0), without lags."""
         runs, n, count = noise.shape[-1], self.plant.size, self.sensor_count
         truth, mode, process_noise, departure = self._start(noise)
         first = self.model.initial_mean
@@ -153,7 +156,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         )
 
     def sense(self, state: MarkovJumpState, noise: Array) -> MarkovJumpState:
-        """The plant moves and jumps, the sensors measure, the nodes update, the copies predict.
+        """Move the plant, measure, update the nodes, and predict the copies.
 
         Source: markov_jump, equations (3), (4), (12)-(22), (36)-(39).
         """
@@ -186,7 +189,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         )
 
     def deliver(self, state: MarkovJumpState, granted: NDArray[np.bool_]) -> MarkovJumpState:
-        """Granted estimates replace the centre's copies, and the centre fuses its copies.
+        """Replace the centre's copies by granted estimates, and fuse the copies.
 
         Source: markov_jump, equations (34)-(39), (55)-(57).
         """
@@ -205,7 +208,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         )
 
     def read(self, state: MarkovJumpState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals named in ``SIGNALS``."""
+        """Return the signals of ``SIGNALS``."""
         prediction = sensed(state.prediction)
         place = self.filters.at(state.time)
         return {
@@ -228,20 +231,20 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         }
 
     def local_means(self, state: MarkovJumpState) -> Array:
-        """The nodes' estimates (sensors, n, N); nothing is fed back to them."""
+        """Return the nodes' estimates (sensors, n, N)."""
         return self._collapse(state.node_mean)
 
     def full_rate_traces(self) -> Array:
-        """Trace of the optimal fused covariance over one period at full rate, (period,).
+        """Return the trace of the optimal fused covariance over one period at full rate, (period,).
 
-        In the steady state, every node sending at every step: tr P_d of (33) and its period.
+        It is tr P_d of (33) in the steady state, with every node sending at every step.
         """
         local = self.recursion.local[..., -self.filters.period :]
         means = np.zeros((self.sensor_count, self.plant.size, self.filters.period))
         return linalg.trace(MatrixWeightedFusion().fuse(means, local).covariance)
 
     def _collapse(self, mean: Array) -> Array:
-        """From ζ̂ (l, a, N) to x̂ = Σ_m ζ̂_m (l, n, N).
+        """Return x̂ = Σ_m ζ̂_m (l, n, N) of ζ̂ (l, a, N), equation (44).
 
         Source: markov_jump, equation (44).
         """
@@ -270,7 +273,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         return log_deviation(covariance, self.reference)
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:
-        """Predicted deviations (l, n, N) of node minus copy, never zero."""
+        """Return the predicted deviations (l, n, N) of node minus copy, above zero."""
         nodes = np.arange(self.sensor_count)
         variance = linalg.diagonal(prediction.lag[nodes, nodes])
         return np.sqrt(np.maximum(variance, (_FLOOR * _FLOOR) * self.reference[:, None]))
@@ -284,7 +287,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         )
 
     def _greedy_variance(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
-        """Sensors join one after another, each time the one that lowers the trace most."""
+        """Return the trace as sensors join in the order of the largest reduction."""
         sent = np.zeros(state.sent.shape, dtype=np.bool_)
         sensors, result = np.arange(self.sensor_count)[:, None], np.empty(sent.shape)
         trace = linalg.trace(state.prior_covariance)
@@ -299,7 +302,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
     def _covariances_with_one_more(
         self, state: MarkovJumpState, prediction: JointPrediction, sent: NDArray[np.bool_]
     ) -> list[Array]:
-        """Fused covariances (n, n, N) if ``sent`` (l, N) and one sensor more transmit, each."""
+        """Return fused covariances (n, n, N) if ``sent`` (l, N) and one more sensor transmit."""
         means, each = self._collapse(state.copy_mean), []
         for sensor in range(self.sensor_count):
             more = sent.copy()

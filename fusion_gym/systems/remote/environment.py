@@ -25,19 +25,19 @@ from fusion_gym.validation import ConfigurationError
 
 @dataclass(frozen=True)
 class RemoteEstimationOptions(PaperOptions):
-    """Scalar sources that drift away from what the centre believes, and a price for every packet.
+    """Scalar sources that a remote estimator tracks at a price for every packet.
 
-    The problem whose optimum is known. Source i follows x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and
-    sensor i sees it exactly. The centre takes over what arrives and predicts a x̂ otherwise. A
-    channel may lose what was granted: independently, or as a Gilbert-Elliott channel whose state of
-    the step before is fed back and observed (``channel="gilbert_elliott"``). With one source, or
-    several that share nothing, a threshold on the absolute error that depends on channel state and
-    tokens is optimal, and ``fusion_gym.solvers`` computes it.
+    The optimum of this problem is known. Source i follows x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and
+    sensor i measures it without noise. The centre's estimate is the delivered value, and a x̂
+    without a delivery. A channel may lose granted packets: independently, or as a Gilbert-Elliott
+    channel whose last state is fed back and observed (``channel="gilbert_elliott"``). With one
+    source, or several that share nothing, the optimal policy is a threshold on the absolute error
+    that depends on channel state and tokens. ``fusion_gym.solvers`` computes it.
 
-    Starting state: x(0) ~ N(0, initial_deviation²), by default 0, and the centre believes 0.
+    Starting state: x(0) ~ N(0, initial_deviation²), by default 0; the centre's estimate is 0.
 
-    With the defaults the reward is the literature's cost, with the opposite sign: the squared
-    error plus ``cost_weight`` for each transmission.
+    With the defaults the reward is the negative of the literature's cost: the squared error plus
+    ``cost_weight`` for each transmission.
     """
 
     sensors: int = 1
@@ -78,11 +78,7 @@ _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 
 
 def build_remote(options: RemoteEstimationOptions) -> Scenario:
-    """The scenario of these options, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the scenario of these options."""
     most = validation.MOST_SENSORS
     sensors = validation.integer("sensors", options.sensors, at_least=1, at_most=most)
     weights = (
@@ -114,7 +110,7 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
 
 
 def _nature(options: RemoteEstimationOptions, coefficient: Array) -> Nature:
-    """A source moves by c a in the place of a."""
+    """Return the departure of the truth: a source moves by c a instead of a."""
     absent = ("true_measurement_noise", "true_threshold_shift")
     nature = Nature.create(options, absent if coefficient.any() else (*absent, "true_transition"))
     largest = float(np.abs(coefficient).max())
@@ -144,11 +140,10 @@ def _channel(options: RemoteEstimationOptions, sensors: int) -> Channel:
 
 
 def _error_scale(options: RemoteEstimationOptions, deviation: Array) -> Array:
-    """What observed errors are divided by (n,): about the optimal threshold of a random walk.
+    """Return the divisor (n,) of observed errors: about a random walk's optimal threshold.
 
-    Without a limit that is (6 price)^1/4 in continuous time, at unit noise and the environment's
-    own price, and σ/√r at a rate r of transmissions, where they are limited. No option of the price
-    changes it: an agent sees the same whatever it is asked for.
+    For unlimited tokens it is (6 price)^1/4 at unit noise and the environment's default price, and
+    else σ/√r at a rate r of transmissions. Options of the price do not change it.
     """
     sensors = len(deviation)
     if options.error_scale is not None:

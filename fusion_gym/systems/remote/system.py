@@ -1,4 +1,10 @@
-"""Scalar sources, each watched by a sensor that sees it exactly, over a channel that may lose.
+"""Scalar sources, each with a noise-free sensor, over a channel that may lose packets.
+
+Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with Markovian
+state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
+
+Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with Markovian
+state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 
 Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
 Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
@@ -29,13 +35,13 @@ _FLOOR = 1e-12  # variance after a delivery, in process variances: zero could no
 
 @dataclass(slots=True)
 class RemoteEstimationState:
-    """Everything about N runs at one time; n sources, one sensor each.
+    """The state of N runs at one time; n sources, one sensor each.
 
     ``truth`` x and ``prior`` a x̂(t-1) (n, N) · ``estimate`` x̂ (n, N), after the delivery ·
     ``prior_variance`` and ``variance`` (n, N), of the errors by age · ``held`` (n, N), the last
     delivered value · ``age`` (n, N), steps since then · ``channel`` (n, N), the state S(t-1) that
-    was fed back · ``next_channel`` (n, N), S(t) · ``lost`` (n, N) bool, whether a packet sent now
-    is lost · ``departure`` (4, N) of the truth from the model, if it departs.
+    was fed back · ``next_channel`` (n, N), S(t) · ``lost`` (n, N) bool, the loss of a packet sent
+    now · ``departure`` (4, N) of the truth from the model, if any.
     """
 
     truth: Array
@@ -73,14 +79,14 @@ SIGNALS = (
 class RemoteEstimationSystem(System[RemoteEstimationState]):
     """n independent sources x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and the optimal estimator.
 
-    x̂ = x on a delivery, a x̂ otherwise: optimal under every rule that is symmetric in the error.
-    Silence then says nothing about the error's sign; what it says about its size the variances by
-    age ignore. The centre feeds back the channel's state and whether a packet arrived, so that the
-    sensor knows x̂.
+    x̂ = x on a delivery and a x̂ otherwise, which is optimal under every rule that is symmetric in
+    the error. Silence then carries no information on the error's sign; the variances by age ignore
+    its information on the error's size. The centre feeds back the channel's state and the arrival
+    of a packet, so that the sensor knows x̂.
 
     Shapes: ``coefficient`` a, ``deviation`` σ, ``initial_deviation`` of x(0), ``error_scale`` that
     divides observed errors, and ``state_weights``: (n,). Where the truth departs by ``nature``, a
-    source moves by c a in the place of a, for I + c (a - I) would let a random walk be.
+    source moves by c a, because I + c (a - I) would not change a random walk.
     """
 
     state_names: tuple[str, ...]
@@ -95,12 +101,12 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
 
     @property
     def sensor_count(self) -> int:
-        """Number of sensors, one a source."""
+        """Number of sensors, one per source."""
         return len(self.coefficient)
 
     @property
     def noise_channels(self) -> int:
-        """Normals of one step: the sources', then those of channel state and loss."""
+        """Normals of one step: sources, channel states and losses."""
         extra = (self.channel.states > 1) + self.channel.loses
         return self.sensor_count * (1 + extra)
 
@@ -117,7 +123,7 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
 
     @property
     def observation(self) -> tuple[Block, ...]:
-        """Blocks of the observation; the channel's is missing where it has no states."""
+        """Blocks of the observation, without the channel's where it has no states."""
         nodes = numbered(self.sensor_count)
         error = Block(
             "error",
@@ -139,7 +145,7 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         return (error, age_block(nodes), *((channel,) if self.channel.states > 1 else ()))
 
     def start(self, noise: Array) -> RemoteEstimationState:
-        """Time 0: x(0) is drawn about zero, which is all that the centre knows."""
+        """Draw x(0) with the mean 0, which is also the centre's estimate."""
         sensors, runs = self.sensor_count, noise.shape[-1]
         noise, departure = self.nature.begin(noise)
         truth = self.initial_deviation[:, None] * noise[:sensors]
@@ -163,7 +169,7 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         )
 
     def sense(self, state: RemoteEstimationState, noise: Array) -> RemoteEstimationState:
-        """The sources and the channels move, the centre predicts."""
+        """Move the sources and the channels, and predict."""
         sensors = self.sensor_count
         a, sigma = self.coefficient[:, None], self.deviation[:, None]
         following, lost = self._coming(state.next_channel, noise[sensors:])
@@ -183,7 +189,7 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
     def deliver(
         self, state: RemoteEstimationState, granted: NDArray[np.bool_]
     ) -> RemoteEstimationState:
-        """What was granted and not lost arrives; elsewhere the centre keeps its prediction."""
+        """Replace the centre's prediction where a granted packet arrives."""
         arrived = granted & ~state.lost
         floor = _FLOOR * self.deviation[:, None] ** 2
         return replace(
@@ -197,7 +203,7 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
     def read(
         self, state: RemoteEstimationState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals named in ``SIGNALS``."""
+        """Return the signals of ``SIGNALS``."""
         return {
             "measurement": state.truth[:, None],
             "innovation": lambda: (state.truth - state.prior)[:, None],
@@ -215,56 +221,50 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         }
 
     def visible(self, state: RemoteEstimationState) -> RemoteEstimationState:
-        """The state without its departure and what the channel is about to do: every grant arrives.
-
-        The sources are what the sensors measure, so they stay.
-        """
+        """Return the state without departure and coming losses; the sensors measure the sources."""
         lost = np.zeros_like(state.lost)
         return replace(state, next_channel=state.channel, lost=lost, departure=None)
 
     @property
     def imagination_channels(self) -> int:
-        """Those of a step but the sources'."""
+        """Normals of the channel in one step."""
         return self.noise_channels - self.sensor_count
 
     def imagine(
         self, state: RemoteEstimationState, mean: Array, covariance: Array, noise: Array
     ) -> RemoteEstimationState:
-        """What the channel does is drawn by its law, from the state that was fed back.
-
-        The sources are what the sensors measure, so they stay, whatever ``mean`` is.
-        """
+        """Draw the channel's coming state and losses from the state that was fed back."""
         following, lost = self._coming(state.channel, noise)
         return replace(state, next_channel=following, lost=lost, departure=None)
 
     def arrival_probability(self, state: RemoteEstimationState) -> Array:
-        """Probability (sensors, N) that a packet sent now arrives, given the channel before."""
+        """Return the probability (sensors, N) of an arrival, given the channel's last state."""
         return self._arrival_probability(state.channel)
 
     def arriving(
         self, state: RemoteEstimationState, packets: NDArray[np.bool_]
     ) -> RemoteEstimationState:
-        """The state in which these packets (sensors, N), if they are sent now, are not lost."""
+        """Return the state in which these packets (sensors, N) are not lost."""
         return replace(state, lost=state.lost & ~packets)
 
     def fused(self, state: RemoteEstimationState) -> tuple[Array, Array]:
-        """The centre's mean (n, N) and covariance by age (n, n, N).
+        """Return the centre's mean (n, N) and covariance by age (n, n, N).
 
-        After a delivery the error is zero; its variance is given as 1e-12 σ².
+        After a delivery the error is zero; its variance is set to 1e-12 σ².
         """
         return state.estimate, _diagonal(state.variance)
 
     def fused_mean(self, state: RemoteEstimationState) -> Array:
-        """The centre's mean (n, N)."""
+        """Return the centre's mean (n, N)."""
         return state.estimate
 
     def local_means(self, state: RemoteEstimationState) -> Array:
-        """The nodes' means (sensors, n, N): each knows its source, and x̂ of the others."""
+        """Return the nodes' means (sensors, n, N): the own source, and x̂ of the others."""
         own = np.eye(self.sensor_count, dtype=np.bool_)[..., None]
         return np.where(own, state.truth, state.estimate)
 
     def open_loop(self, horizon: int) -> Array:
-        """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
+        """Return the mean error variance (n,) over t = 1..horizon without a delivery."""
         variance, total = self.initial_deviation**2, np.zeros(self.sensor_count)
         for _ in range(horizon):
             variance = self.coefficient**2 * variance + self.deviation**2
@@ -272,14 +272,14 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         return total / horizon
 
     def rounding(self, horizon: int) -> tuple[float, float]:
-        """See :class:`System`; of a source's own noise 1e-6 deviations may be lost."""
+        """See :class:`System`; 1e-6 of a source's noise deviation may be lost."""
         largest = horizon * self.open_loop(horizon) / self.deviation**2
         return 1e-8 * float(largest.max()), 0.0
 
     def _coming(
         self, channel: NDArray[np.int64], noise: Array
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """The channel's next state and whether it loses a packet, from what it was (sensors, N)."""
+        """Return the channel's next state and loss from its last state (sensors, N)."""
         sensors = self.sensor_count
         following, lost = channel, np.zeros(channel.shape, dtype=np.bool_)
         if self.channel.states > 1:

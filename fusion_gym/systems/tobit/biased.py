@@ -45,18 +45,17 @@ _REFERENCE_HORIZON = 10
 
 @dataclass(frozen=True)
 class BiasedOscillatorOptions(FeedbackOptions):
-    """An oscillator driven by a stochastic bias, seen by two sensors that saturate at ±5.
+    """An oscillator driven by a stochastic bias, observed by two sensors that saturate at ±5.
 
-    A plant whose state is driven by a bias that no sensor sees. Each sensor measures one component
-    of the state and reports it clipped to an interval. One sensor a step may transmit. The nodes
-    run Tobit Kalman filters on state and bias together, and the centre fuses them and feeds the
-    result back.
+    The bias drives the state and no sensor measures it. Each sensor measures one component of the
+    state and clips it to an interval. One sensor may transmit per step. The nodes run Tobit Kalman
+    filters on state and bias together. The centre fuses them and feeds the result back.
 
-    Starting state: x₀ ~ N((5, 0), 0.1 I), b₀ ~ N(0, 0.1). The first measurement is known to the
-    centre free of charge.
+    Starting state: x₀ ~ N((5, 0), 0.1 I), b₀ ~ N(0, 0.1). The centre receives the first measurement
+    without charge.
 
-    The defaults are the oscillator of the paper's Section IV.A. Not given in the paper, our choice:
-    ``information_shares`` (equal) and the reward.
+    The defaults are the oscillator of the paper's Section IV.A. The paper does not give, and we
+    chose: ``information_shares`` (equal) and the reward.
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
@@ -105,17 +104,17 @@ class BiasedOscillatorOptions(FeedbackOptions):
 
 @dataclass(frozen=True)
 class BiasedTrackingOptions(BiasedOscillatorOptions):
-    """A target with an unknown acceleration, its position and its velocity measured.
+    """A target with an unknown acceleration, whose position and velocity are measured.
 
     The state is position in metres and velocity in metres a second, sampled every 0.1 s; the bias
     is the acceleration. Sensor 0 measures the position, sensor 1 the velocity, practically
-    uncensored, and one of them a step may transmit. The nodes run Tobit Kalman filters on state and
-    bias together, and the centre fuses them and feeds the result back.
+    uncensored. One of them may transmit per step. The nodes run Tobit Kalman filters on state and
+    bias together. The centre fuses them and feeds the result back.
 
-    Starting state: x₀ ~ N((10, 0), I), b₀ ~ N(0, 0.1). The first measurement is known to the centre
-    free of charge.
+    Starting state: x₀ ~ N((10, 0), I), b₀ ~ N(0, 0.1). The centre receives the first measurement
+    without charge.
 
-    The defaults are the target of the paper's Section IV.B. Not given in the paper, our choice:
+    The defaults are the target of the paper's Section IV.B. The paper does not give, and we chose:
     ``information_shares`` (equal) and the reward.
     """
 
@@ -130,20 +129,12 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
 
 
 def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
-    """The oscillator's scenario, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the oscillator's scenario."""
     return _build(options)
 
 
 def build_biased_tracking(options: BiasedTrackingOptions) -> Scenario:
-    """The target's scenario, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the target's scenario."""
     return _build(options)
 
 
@@ -180,9 +171,9 @@ def _build(options: BiasedOscillatorOptions) -> Scenario:
 
 
 def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPlant, int]:
-    """Plant of ξ = [x; b], equations (10) and (11), and the number of states in x.
+    """Return the plant of ξ = [x; b], equations (10) and (11), and the number of states in x.
 
-    A filter that ignores the bias believes that it has no effect on x.
+    In the model of a filter that is not bias-aware, b has no effect on x.
     """
     transition = validation.square("transition", options.transition)
     states = len(transition)

@@ -1,5 +1,9 @@
 """The paper's Tobit Kalman filter: it minimises a bound of its error covariance.
 
+Source: tobit_token_bucket, Theorems 1 and 2. Simulation confirms four corrections, which
+docs/tobit_oscillator.md describes: (29) starts from the previous posterior; K_{t+1} in (30) is K_t;
+C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter updates with the held value.
+
 Source: tobit_token_bucket, Theorems 1 and 2. Four readings, each checked by simulation and
 described in docs/tobit_oscillator.md: (29) starts from the previous posterior; K_{t+1} in (30) is
 K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter really updates with the held value.
@@ -42,10 +46,13 @@ class BoundConstants:
 
     @classmethod
     def create(cls, epsilon: ArrayLike) -> BoundConstants:
-        """From the 14 scalars.
+        """Return the constants of the 14 scalars.
+
+        Args:
+            epsilon: ε₁..ε₁₄, each > 0.
 
         Raises:
-            ConfigurationError: not 14 numbers > 0.
+            ConfigurationError: another number of entries, or an entry <= 0.
         """
         e = validation.positive(
             "bound_epsilon", validation.array("bound_epsilon", epsilon, (14,)), (14,)
@@ -69,8 +76,7 @@ class EventError:
 
     Ξ(G) = ``growth`` G + ``offset``, G' = Ξ(G), G₀ = ``initial``; each of shape (sensors, 1), in
     squared units of the measurement. It belongs to the dynamic event trigger: a delivered
-    measurement is the current one and has no event error, whatever the policy.
-    Source: tobit_token_bucket, equations (33), (34) and below (30).
+    measurement is the current one and has no event error, under any policy.
     """
 
     growth: Array
@@ -78,10 +84,7 @@ class EventError:
     initial: Array
 
     def at(self, time: Array) -> Array:
-        """Ξ(G_{t-1}) at the steps t = ``time`` (N,) counted from 1, shape (sensors, N).
-
-        The trigger's first decision, at t = 1, uses η₀, whose square G₀ bounds.
-        """
+        """Return Ξ(G_{t-1}) (sensors, N) at the steps t = ``time`` (N,), counted from 1."""
         rate, logarithm = self._growth_rate
         ramp = np.where(rate == 0.0, time, np.expm1(logarithm * time) / np.where(rate, rate, 1.0))
         return self.initial * np.exp(logarithm * time) + self.offset * ramp
@@ -102,10 +105,18 @@ class EventError:
         young: tuple[float, float],
         sensors: int,
     ) -> EventError:
-        """From σ_m, λ_m, χ_m, η_{m,0} of the trigger and (d, e) of the bound.
+        """Return the bound of a dynamic event trigger.
+
+        Args:
+            threshold: σ of each sensor, >= 0.
+            decay: λ of each sensor, >= 0.
+            divisor: χ of each sensor, > 0.
+            initial: η₀ of each sensor, >= 0.
+            young: the factors (d, e) of Young's inequality, > 0.
+            sensors: number of sensors.
 
         Raises:
-            ConfigurationError: a wrong shape, a negative number, or χ, d, e not > 0.
+            ConfigurationError: a wrong shape, or a number outside these limits.
         """
         shape = (sensors,)
         sigma = validation.not_negative("trigger_threshold", threshold, shape)
@@ -201,7 +212,7 @@ class BoundTobitFilter:
     def _delivered(
         self, matrix: Array, moments: Array, expectation: Expectation, time: Array
     ) -> tuple[Array, Array]:
-        """θ = 0: correction and bound."""
+        """Return correction and bound after a delivery, θ = 0."""
         k1, k2, k3, _, _, k6, _, k8 = self.constants.kappa
         variance, threshold = self.sensors.variance, self.sensors.finite_threshold
         q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)

@@ -1,4 +1,4 @@
-"""Nodes and fusion centre: from the centre's prediction and what arrived to the fused estimate."""
+"""Nodes and fusion centre: from prediction and deliveries to the fused estimate."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from fusion_gym.validation import ConfigurationError
 
 
 class CentrePrediction(NamedTuple):
-    """What centre and nodes expect before anything is sent.
+    """The prediction of centre and nodes before a transmission.
 
     ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
-    (n, n, N) of the covariance if nobody transmits, and where nodes have covariances of their own,
-    their ``outcomes`` z of x = x̂ + G z.
+    (n, n, N) of the covariance without a transmission, and, where nodes have covariances of their
+    own, their ``outcomes`` z of x = x̂ + G z.
     """
 
     expectation: Expectation
@@ -38,7 +38,7 @@ class CentrePrediction(NamedTuple):
 
 
 class Centre(Protocol):
-    """Nodes and centre behind one interface."""
+    """The interface of nodes and centre."""
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -47,16 +47,16 @@ class Centre(Protocol):
 
     @property
     def predictable(self) -> bool:
-        """Whether its covariances follow from the deliveries alone, whatever is measured."""
+        """Whether the covariances depend on the deliveries only."""
         return False
 
     @property
     def separable(self) -> bool:
-        """Whether :meth:`single` is there, and costs less than one update after another."""
+        """Whether :meth:`single` is available, and faster than one update after another."""
         return False
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
-        """Expectations under the centre's prediction (n, N), (n, n, N)."""
+        """Return the expectations under the centre's prediction (n, N), (n, n, N)."""
         ...
 
     def update(
@@ -67,9 +67,8 @@ class Centre(Protocol):
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
-        """Posterior mean (n, N) and covariance (n, n, N).
-
-        It takes the ``granted`` (sensors, N) of the measurements (sensors, m, N).
+        """Return the posterior mean (n, N) and covariance (n, n, N) after the ``granted``
+        (sensors, N).
         """
         ...
 
@@ -81,46 +80,41 @@ class Centre(Protocol):
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Array:
-        """Means (sensors, n, N) of the nodes before any feedback, of a centre alone its own."""
+        """Return the nodes' means (sensors, n, N) before feedback; without nodes, the centre's."""
         own = self.update(mean, covariance, prediction, measurement, granted)[0]
         return np.broadcast_to(own, (len(granted), *own.shape))
 
     def single(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
-        """Posterior means (sensors, n, N) and covariances (sensors, n, n, N), one sensor granted.
-
-        Those of as many calls of :meth:`update`.
-
-        Raises:
-            RuntimeError: a centre that is not :attr:`separable`.
+        """Return the posterior means (sensors, n, N) and covariances (sensors, n, n, N) of single
+        grants.
         """
         raise RuntimeError(f"{type(self).__name__} is not separable")
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
-        """Weighted fused trace (N,) if nobody transmits, its reduction (sensors, N) by each alone.
-
-        ``weights`` (n,) weigh the entries of the trace.
+        """Return the fused trace (N,) of a silent step, weighted by ``weights`` (n,), and its
+        reductions.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Feedback:
-    """How the nodes get the centre's prediction as their prior.
+    """The prior that the nodes get from the centre's prediction.
 
-    With shares w_m that add up to 1, ``share`` (sensors, 1), node m gets it with the covariance
-    inflated by 1/w_m. That is the paper's feedback (51) and local prediction (29) in one: both
-    the fused covariance and the process covariance are inflated, and it is the inflation of both
-    that keeps information from being counted twice when the nodes' informations are added up.
+    With shares w_m of sum 1, ``share`` (sensors, 1), node m gets the prediction with its covariance
+    multiplied by 1/w_m. This is the paper's feedback (51) and local prediction (29) in one: it
+    inflates both the fused covariance and the process covariance. Both inflations are necessary so
+    that the sum of the nodes' information counts nothing twice.
 
-    With shares of 1 every node gets the prediction as it is. Nothing keeps the common prior from
-    being counted several times then but the fusion rule, which must be a form of covariance
-    intersection. Two nodes with a common prior and independent measurements are just the
-    structure for which the inverse form was derived, so "ici" keeps its bound here. With a single
-    delivery every form returns the node that got it.
+    With shares of 1 every node gets the prediction unchanged. Only the fusion rule then avoids
+    counting the common prior several times; it must be a form of covariance intersection. Two nodes
+    with a common prior and independent measurements are the structure for which the inverse form
+    was derived, so "ici" keeps its bound here. With a single delivery every form returns the node
+    that received it.
 
     Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (28).
     """
@@ -129,15 +123,19 @@ class Feedback:
 
     @classmethod
     def in_full(cls, sensors: int) -> Feedback:
-        """Return the feedback that gives every node the whole prediction."""
+        """Return the feedback of the whole prediction to every node."""
         return cls(np.ones((sensors, 1)))
 
     @classmethod
     def in_shares(cls, share: ArrayLike | None, sensors: int) -> Feedback:
-        """Shares w_m > 0 with sum 1; ``None`` stands for equal shares.
+        """Return the feedback of shares of the prediction.
+
+        Args:
+            share: w_m > 0 with sum 1 (sensors,), or None for equal shares.
+            sensors: number of sensors.
 
         Raises:
-            ConfigurationError: a wrong shape, an entry <= 0, or a sum other than 1.
+            ConfigurationError: a wrong shape, an entry <= 0, or another sum.
         """
         if share is None:
             return cls(np.full((sensors, 1), 1.0 / sensors))
@@ -152,7 +150,7 @@ class Feedback:
 
 @dataclass(frozen=True)
 class NodeCentre(Centre):
-    """A centre with a node filter for each sensor, which gets the result back."""
+    """A centre with a node filter for each sensor, with feedback."""
 
     filter: NodeFilter
     feedback: Feedback
@@ -164,16 +162,16 @@ class NodeCentre(Centre):
 
     @property
     def predictable(self) -> bool:
-        """See :class:`Centre`: with Kalman filters, where nothing is censored."""
+        """See :class:`Centre`; true for Kalman filters of uncensored sensors."""
         return type(self.filter) is KalmanFilter and self.sensors.unlimited
 
 
 @dataclass(frozen=True)
 class FeedbackCentre(NodeCentre):
-    """A node filter for each sensor, fusion, and the result fed back to the nodes.
+    """A node filter for each sensor, fusion, and feedback of the result to the nodes.
 
     Nodes and fusion work on z of x = x̂ + G z with G Gᵀ the covariance of the prediction, so that
-    only regular covariances are inverted.
+    all inverted covariances are regular.
 
     Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
     equations (18)-(28).
@@ -199,7 +197,7 @@ class FeedbackCentre(NodeCentre):
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
-        """Each node takes the planned outcome of the network's answer; the centre fuses."""
+        """See :class:`Centre`; each node uses its planned outcome of a grant or of silence."""
         outcomes, root, share = _outcomes(prediction), prediction.root, self.feedback.share[:, None]
         grant = granted[:, None, None]
         own = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
@@ -222,7 +220,7 @@ class FeedbackCentre(NodeCentre):
     def _shift(
         self, prediction: CentrePrediction, measurement: Array, granted: NDArray[np.bool_]
     ) -> Array:
-        """The nodes' means (sensors, n, N) of z."""
+        """Return the nodes' means (sensors, n, N) of z."""
         outcomes = _outcomes(prediction)
         innovation = measurement - prediction.expectation.value
         delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
@@ -232,7 +230,7 @@ class FeedbackCentre(NodeCentre):
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
-        """See :class:`Centre`; by the bound where the filter minimises one."""
+        """See :class:`Centre`; a filter that minimises a bound uses the bound."""
         outcomes, root = _outcomes(prediction), prediction.root
         share = self.feedback.share[:, None, None]
         covariances = outcomes.silent_covariance / share, outcomes.delivered_covariance / share
@@ -245,12 +243,12 @@ class FeedbackCentre(NodeCentre):
 
 @dataclass(frozen=True)
 class FederatedCentre(NodeCentre):
-    """Nodes with Kalman filters whose informations add up, by the same algebra at the centre.
+    """Nodes with Kalman filters whose information adds up, computed at the centre.
 
-    Nodes that share the prediction P in shares w_m with the sum 1 have Σ (w_m P⁻¹ + Cᵀ N⁻¹ C)
-    together. That is the centre's own update by one delivered scalar after another, which
-    inverts no covariance. A silent sensor of weight Z says that its innovation was zero, with the
-    noise N + Z⁻¹; a delivery adds what is missing, N⁻¹ - (N + Z⁻¹)⁻¹ = (N + N Z N)⁻¹.
+    Nodes that share the prediction P in shares w_m of sum 1 have the information Σ (w_m P⁻¹ + Cᵀ
+    N⁻¹ C) together. This equals the centre's own update by one delivered scalar after another,
+    which inverts no covariance. A silent sensor of weight Z acts as an innovation of zero with the
+    noise N + Z⁻¹; a delivery adds the difference N⁻¹ - (N + Z⁻¹)⁻¹ = (N + N Z N)⁻¹.
 
     Source: tobit_token_bucket, equations (20)-(23), (50), (51); round_robin_tobit, equations
     (18)-(28).
@@ -264,7 +262,7 @@ class FederatedCentre(NodeCentre):
         return True
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
-        """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
+        """See :class:`Centre`; ``held`` and ``time`` have no effect."""
         sensors, weight = self.sensors, self.filter.silence
         expectation, root = self.filter.expect(mean), linalg.root(covariance)
         observed = linalg.matmul(sensors.measurement_matrix, root)
@@ -331,7 +329,7 @@ class FederatedCentre(NodeCentre):
     def _whitened(
         self, prediction: CentrePrediction, measurement: Array, places: Any
     ) -> tuple[Array, Array]:
-        """What sensors would deliver, of unit noise: N^-½ q C G (…, m, n, N) and N^-½ (y - ŷ)."""
+        """Return N^-½ q C G (…, m, n, N) and N^-½ (y - ŷ): deliveries with unit noise."""
         sensors, expectation, weight = self.sensors, prediction.expectation, self.filter.silence
         noise = sensors.variance[places] * expectation.truncated_variance[places]
         innovation = measurement[places] - expectation.value[places]
@@ -346,7 +344,7 @@ class FederatedCentre(NodeCentre):
 
 @dataclass(frozen=True)
 class SequentialCentre(Centre):
-    """The centre itself takes the delivered measurements one after another; there are no nodes."""
+    """A centre without nodes, which processes the deliveries one after another."""
 
     filter: AssumedDensityFilter
 
@@ -356,7 +354,7 @@ class SequentialCentre(Centre):
         return self.filter.sensors
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
-        """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
+        """See :class:`Centre`; ``held`` and ``time`` have no effect."""
         root = linalg.root(covariance)
         expectation = self.filter.expect(mean, root)
         floor = 1e-3 * self.sensors.variance
@@ -384,20 +382,20 @@ class SequentialCentre(Centre):
 
 
 def _deviation(sensors: CensoredSensors, expectation: Expectation, spread: Array) -> Array:
-    """Standard deviation of the innovation from the variances ``spread`` of C x, all (l, m, N)."""
+    """Return the innovation's deviation from the variances ``spread`` of C x, all (l, m, N)."""
     q = expectation.uncensored_probability
     return np.sqrt(q * q * spread + expectation.noise_variance + 1e-3 * sensors.variance)
 
 
 def _stack(values: Array) -> Array:
-    """The channels of all sensors one after another, (sensors · m, …), of (sensors, m, …)."""
+    """Return the channels of all sensors (sensors · m, …) of (sensors, m, …)."""
     return values.reshape(-1, *values.shape[2:])
 
 
 def _shifted(
     mean: Array, prediction: CentrePrediction, matrix: Array, value: Array
 ) -> tuple[Array, Array]:
-    """Mean and covariance of x = x̂ + G z after :func:`joint_update` of z."""
+    """Return mean and covariance of x = x̂ + G z after :func:`joint_update` of z."""
     shift, covariance = joint_update(matrix, value)
     root = prediction.root
     return mean + linalg.matvec(root, shift), linalg.congruence(root, covariance)

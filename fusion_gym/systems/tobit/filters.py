@@ -1,12 +1,12 @@
-"""What every node filter of censored sensors offers, and the two that take values as they are.
+"""The interface of node filters of censored sensors, and two filters that ignore censoring.
 
-Before the network answers, a node already knows everything but whether its request is granted:
-the delivered value would be the current measurement, the alternative is the held one. So a filter
-plans both outcomes at once; a grant selects one of them. Neither covariance depends on the
-current measurement, so a policy may look at both without looking at the measurement.
+Before the network answers, a node does not know only whether its request is granted: a delivered
+value is the current measurement, and otherwise the held value stays. A filter therefore plans both
+outcomes, and the grant selects one. Neither covariance depends on the current measurement, so a
+policy may use both without using the measurement.
 
 A node's prior is x = x̂ + G z with z ~ N(0, I) and G Gᵀ its covariance, which may be singular. The
-posterior of z is regular, whatever G is.
+posterior of z is regular for every G.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from fusion_gym.validation import ConfigurationError
 
 
 class Expectation(NamedTuple):
-    """What a node expects of its next measurement; every array has shape (sensors, m, N).
+    """The predicted distribution of a node's next measurement; every array is (sensors, m, N).
 
     ``latent``: C x̂, the expectation without censoring. ``value``: the expectation of the censored
-    measurement. ``noise_variance``: variance of the censored measurement given the predicted
-    state. ``uncensored_probability`` q, ``hazard`` λ and ``truncated_variance`` v of the
-    standardised threshold (of 1, 0 and 1 where a filter ignores censoring).
+    measurement. ``noise_variance``: variance of the censored measurement given the predicted state.
+    ``uncensored_probability`` q, ``hazard`` λ and ``truncated_variance`` v of the standardised
+    threshold (1, 0 and 1 for a filter that ignores censoring).
     """
 
     latent: Array
@@ -48,8 +48,8 @@ _RIDGE = 1e-14  # relative, for each row: above the rounding of a Gram matrix
 class Outcomes(NamedTuple):
     """Both outcomes at every node, in the coordinates z of its prior.
 
-    ``correction`` (sensors, m, n, N): the transposed gain of a delivery, so that the delivered
-    mean is correctionᵀ innovation; ``delivered_covariance`` (sensors, n, n, N); ``silent_mean``
+    ``correction`` (sensors, m, n, N): the transposed gain of a delivery, so that the delivered mean
+    is correctionᵀ innovation; ``delivered_covariance`` (sensors, n, n, N); ``silent_mean``
     (sensors, n, N) and ``silent_covariance`` (sensors, n, n, N).
     """
 
@@ -64,31 +64,39 @@ class NodeFilter(Protocol):
 
     @property
     def sensors(self) -> CensoredSensors:
-        """The sensors whose measurements the nodes filter."""
+        """The sensors of the nodes."""
         ...
 
     def expect(self, mean: Array) -> Expectation:
-        """Expectation of the measurements from the prior means (n, N) or (sensors, n, N)."""
+        """Return the predicted measurements from prior means (n, N) or (sensors, n, N)."""
         ...
 
     def outcomes(
         self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
-        """Both outcomes from ``matrix`` C G (sensors, m, n, N).
+        """Return both outcomes.
 
-        ``held`` (sensors, m, N) is the last delivered measurement, ``time`` (N,) the number of
-        the step in its episode, counted from 1.
+        Args:
+            matrix: C G (sensors, m, n, N).
+            expectation: the predicted measurements.
+            held: the last delivered measurement (sensors, m, N).
+            time: the number of the step in its episode (N,), counted from 1.
         """
         ...
 
 
 def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tuple[Array, Array]:
-    """Correction S⁻¹ B (…, m, n, N) and posterior covariance I - Bᵀ S⁻¹ B (…, n, n, N).
+    """Return the correction S⁻¹ B (…, m, n, N) and the covariance I - Bᵀ S⁻¹ B (…, n, n, N).
 
-    The minimum-variance update of z ~ N(0, I) for ``matrix`` B (…, m, n, N) and innovation
-    covariance S = B Bᵀ + N, with N = diag(``noise``) + ``bias`` ``bias``ᵀ, both (…, m, N). Where
-    the difference would lose its digits it is the Joseph form (I - K B) (I - K B)ᵀ + K N Kᵀ, with a
-    ridge in proportion to its diagonal that keeps it definite.
+    This is the minimum-variance update of z ~ N(0, I) with the innovation covariance S = B Bᵀ + N,
+    N = diag(``noise``) + ``bias`` ``bias``ᵀ. Where the difference would lose its digits the
+    covariance has the Joseph form (I - K B) (I - K B)ᵀ + K N Kᵀ, with a ridge in proportion to its
+    diagonal that keeps it definite.
+
+    Args:
+        matrix: B (…, m, n, N).
+        noise: variances (…, m, N).
+        bias: (…, m, N).
     """
     spread = linalg.gram(matrix)
     total = linalg.add_diagonal(spread, noise)
@@ -135,11 +143,10 @@ class Scalar(NamedTuple):
         return cls(root, projection, linalg.matvec(root, projection), noise, variance)
 
     def posterior(self, share: Array | float) -> Array:
-        """Root of P - P cᵀ c P s/S, where the measurement explains the share s of its variance.
+        """Return a root of P - P cᵀ c P s/S, where the measurement explains the share s of its
+        variance.
 
-        It is G (I - w g gᵀ) with (1 - w gᵀ g)² = 1 - s gᵀ g/S, which loses no digits whatever P is.
-        Source: J. E. Potter's form; P. S. Maybeck, "Stochastic models, estimation, and control",
-        volume 1, 1979, section 7.3.
+        It is G (I - w g gᵀ) with (1 - w gᵀ g)² = 1 - s gᵀ g/S, which loses no digits for any P.
         """
         left = share * self.noise + (1.0 - share) * self.variance
         weight = share / (self.variance + np.sqrt(left * self.variance))
@@ -147,10 +154,14 @@ class Scalar(NamedTuple):
 
 
 def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
-    """Mean (…, n, N) and covariance (…, n, n, N) of z ~ N(0, I) after ``value`` = B z + v.
+    """Return mean (…, n, N) and covariance (…, n, n, N) of z ~ N(0, I) given B z + v.
 
-    ``matrix`` B (…, c, n, N) and ``value`` (…, c, N) of any number of channels, v ~ N(0, I). It is
-    (I + Bᵀ B)⁻¹, or one channel after another where that sum would lose its digits.
+    The covariance is (I + Bᵀ B)⁻¹, or the result of one channel after another where that sum would
+    lose its digits.
+
+    Args:
+        matrix: B (…, c, n, N), of any number of channels c.
+        value: B z + v (…, c, N), with v ~ N(0, I).
     """
     size = matrix.shape[-2]
     both = np.concatenate([matrix, value[..., None, :]], axis=-2)
@@ -177,10 +188,10 @@ def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class KalmanFilter:
-    r"""Kalman filter that ignores censoring; when nothing arrives the prior is the posterior.
+    r"""Kalman filter that ignores censoring; without a delivery the prior is the posterior.
 
-    S = C P Cᵀ + R, K = P Cᵀ S⁻¹. Biased wherever measurements are censored: it stands beside the
-    Tobit filters to show what they are worth.
+    S = C P Cᵀ + R, K = P Cᵀ S⁻¹. It is biased where measurements are censored, and serves as the
+    reference for the Tobit filters.
 
     Equation:
         $$
@@ -204,7 +215,7 @@ class KalmanFilter:
 
     @property
     def silence(self) -> Array | None:
-        """Weight Z (sensors, 1) of what a silent sensor says; ``None``: nothing."""
+        """Weight Z (sensors, 1) of a silent sensor's information; ``None`` for none."""
         return None
 
     def expect(self, mean: Array) -> Expectation:
@@ -223,7 +234,7 @@ class KalmanFilter:
     def outcomes(
         self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
-        """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
+        """See :class:`NodeFilter`; ``held`` and ``time`` have no effect."""
         weighted = expectation.uncensored_probability[:, :, None] * matrix
         noise = self.sensors.variance * expectation.truncated_variance
         correction, delivered = linear_update(weighted, noise)
@@ -234,21 +245,20 @@ class KalmanFilter:
 
 @dataclass(frozen=True)
 class StochasticEventFilter(KalmanFilter):
-    r"""Kalman filter for which silence is a measurement too, of variance R + Z⁻¹.
+    r"""Kalman filter for which silence is a measurement, of variance R + Z⁻¹.
 
-    A sensor that stays silent with probability exp(-zᵀ Z z / 2), z its innovation and
-    Z = ``weight`` · I, says by its silence that z was small: as if z = 0 had been measured with
-    the additional noise variance Z⁻¹. So the silent mean is the prior's, and
-    P' = P - P Cᵀ (C P Cᵀ + R + Z⁻¹)⁻¹ C P. Under federated fusion several nodes together give the
-    exact posterior, whatever mixture of deliveries and silences occurred, because z is taken
-    against the centre's prediction, which all nodes share.
+    A sensor stays silent with probability exp(-zᵀ Z z / 2), z its innovation and Z = ``weight`` ·
+    I. Its silence is equivalent to a measurement z = 0 with the additional noise variance Z⁻¹. The
+    silent mean is therefore the prior's, and P' = P - P Cᵀ (C P Cᵀ + R + Z⁻¹)⁻¹ C P. Under
+    federated fusion several nodes together give the exact posterior for every mixture of deliveries
+    and silences, because z refers to the centre's prediction, which all nodes share.
 
-    Exact if the policy is ``stochastic_event`` with this weight, every request is granted and the
-    sensors are uncensored. Otherwise silence is over-interpreted: after a denial, under censoring
-    or with a more silent policy the claimed covariance is too small.
+    The filter is exact if the policy is ``stochastic_event`` with this weight, every request is
+    granted and the sensors are uncensored. After a denial, under censoring or with a policy that
+    transmits less, the claimed covariance is too small.
 
     ``weight`` has shape (sensors, 1), in the inverse squared unit of the measurement, >= 0; with
-    weight 0 silence says nothing. Build one with :meth:`create`.
+    weight 0 silence carries no information.
 
     Equation:
         $$
@@ -275,7 +285,11 @@ class StochasticEventFilter(KalmanFilter):
 
     @classmethod
     def create(cls, sensors: CensoredSensors, weight: ArrayLike | None) -> StochasticEventFilter:
-        """Check the weight, one number > 0 or one a sensor.
+        """Return the filter of a weight.
+
+        Args:
+            sensors: the sensors.
+            weight: one number > 0 or one per sensor.
 
         Raises:
             ConfigurationError: no weight, another number of entries, or an entry <= 0.
@@ -296,7 +310,7 @@ class StochasticEventFilter(KalmanFilter):
     def outcomes(
         self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
-        """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
+        """See :class:`NodeFilter`; ``held`` and ``time`` have no effect."""
         plain = super().outcomes(matrix, expectation, held, time)
         # Both sides times √Z, so that weight 0 is no exception: √Z C measured with √Z R √Z + I.
         noise = 1.0 + self.weight[:, None] * expectation.noise_variance

@@ -18,11 +18,11 @@ _MOST_CHANNELS = 100  # whose joint covariance is solved in every step
 
 @dataclass(frozen=True)
 class JointCentre(FederatedCentre):
-    r"""Kalman filter at the centre, of all measurements that arrive in a step; there are no nodes.
+    r"""Kalman filter at the centre, of all deliveries of a step, without nodes.
 
-    With C and y the rows of what has arrived and R the covariance of their noises, correlations
-    between sensors included: S = C P Cᵀ + R, K = P Cᵀ S⁻¹, x̂ = x⁻ + K (y - C x⁻), P = P⁻ - K C P⁻.
-    Optimal for uncensored sensors; censoring is ignored.
+    With C and y the delivered rows and R the joint covariance of their noises: S = C P Cᵀ + R, K =
+    P Cᵀ S⁻¹, x̂ = x⁻ + K (y - C x⁻), P = P⁻ - K C P⁻. It is optimal for uncensored sensors and
+    ignores censoring.
 
     Equation:
         $$
@@ -72,11 +72,14 @@ class JointCentre(FederatedCentre):
 
 
 def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:
-    """The centre of ``filter="joint"``.
+    """Return the centre of ``filter="joint"``.
+
+    Args:
+        options: options of the environment.
+        sensors: the sensors.
 
     Raises:
-        ConfigurationError: an option of the nodes' fusion, for there are no nodes, or more than
-            100 channels.
+        ConfigurationError: an option of the nodes' fusion, or more than 100 channels.
     """
     refuse_fusion(options, "joint")
     channels = sensors.noise_channels

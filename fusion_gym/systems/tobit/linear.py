@@ -1,4 +1,4 @@
-"""A linear system of one's own: any plant, any number of sensors, a network and a fusion centre."""
+"""A linear system of your own: any plant, any number of sensors, a network and a fusion centre."""
 
 from __future__ import annotations
 
@@ -43,28 +43,28 @@ _REFERENCE_HORIZON = 10
 
 @dataclass(frozen=True)
 class LinearFusionOptions(FeedbackOptions):
-    """Any linear plant, x' = A x + w, and any sensors of it, y = C x + v, each with its own size.
+    """Any linear plant x' = A x + w and any sensors y = C x + v, each of its own size.
 
-    Every sensor has a Kalman filter; the centre fuses them and feeds the result back. Where some
-    sensor is censored, the centre takes what arrives in an assumed-density filter of its own. At
-    every step the policy requests transmissions, and the token bucket grants or denies them.
+    Every sensor has a Kalman filter; the centre fuses them and feeds the result back. If a sensor
+    is censored, the default is one assumed-density filter at the centre. At every step the policy
+    requests transmissions, and the token bucket grants or denies them.
 
-    A sensor whose covariance R is not diagonal reports R^(-1/2) y, which holds the same.
+    A sensor whose covariance R is not diagonal reports the equivalent R^(-1/2) y.
 
-    Noises of different sensors are independent, unless ``joint_measurement_covariance`` stands in
-    the place of ``measurement_covariances``: the covariance of all channels of all sensors, one
-    sensor after another. The centre then takes what arrives in one filter (``"joint"``), or the
-    nodes' estimates are joined by covariance intersection.
+    Noises of different sensors are independent, unless you replace ``measurement_covariances`` by
+    ``joint_measurement_covariance``, the covariance of all channels of all sensors in their order.
+    The centre then processes the deliveries in one filter (``"joint"``), or covariance intersection
+    joins the nodes' estimates.
 
     Starting state: x₀ ~ N(``initial_mean``, ``initial_covariance``), by default zero and the
-    identity. The first measurement is known to the centre free of charge: the first estimate
-    uses it.
+    identity. The centre receives the first measurement without charge, and the first estimate uses
+    it.
 
-    The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration;
-    one sensor measures its position in metres, one its velocity in metres a second.
+    The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration. One
+    sensor measures its position in metres, one its velocity in metres a second.
 
     v2: ``reward_scale`` multiplies the state weights: a moderate policy costs 1 a step by default.
-    Entries of beliefs scale by its errors, and the price of a token is 0.5.
+    Its errors scale the entries of beliefs, and the price of a token is 0.5.
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
@@ -105,7 +105,7 @@ class LinearFusionOptions(FeedbackOptions):
     is the Kalman filter for the policy ``stochastic_event``."""
 
     def nominal(self) -> LinearFusionOptions:
-        """Return the options whose simulation scales the reward: whatever the filter, the same."""
+        """Return the options whose simulation scales the reward, equal for all filters."""
         return replace(
             super().nominal(),
             filter=None,
@@ -117,11 +117,7 @@ class LinearFusionOptions(FeedbackOptions):
 
 
 def build_linear(choice: LinearFusionOptions) -> Scenario:
-    """The scenario of these options, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the scenario of these options."""
     validation.horizon(choice.horizon)
     plant = _plant(choice)
     sensors = _sensors(choice, plant.size)
@@ -170,11 +166,7 @@ def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
 
 
 def _names(value: Any, states: int) -> tuple[str, ...]:
-    """The states' names, by default x1, x2, …
-
-    Raises:
-        ConfigurationError: another number of them, or some that are no different words.
-    """
+    """Return the states' names, by default x1, x2, …"""
     if value is None:
         return tuple(f"x{i + 1}" for i in range(states))
     listed = isinstance(value, (list, tuple)) and len(value) == len(set(map(repr, value))) == states
@@ -185,11 +177,7 @@ def _names(value: Any, states: int) -> tuple[str, ...]:
 
 
 def _check_rules(options: LinearFusionOptions) -> None:
-    """Whether filter and fusion stay right where sensors share noise.
-
-    Raises:
-        ConfigurationError: they would count what the sensors share several times.
-    """
+    """Refuse a filter or a fusion that would count the sensors' common noise several times."""
     why = "for the sensors' noises are correlated"
     for name in ("filter", "memory_filter"):
         kind = getattr(options, name)

@@ -1,4 +1,4 @@
-"""The sensors of a linear system of one's own, from plain lists: each has a size of its own."""
+"""The sensors of a linear system of your own, from plain lists: each has its own size."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,14 +17,20 @@ _JOINT = "joint_measurement_covariance"
 def linear_sensors(
     states: int, matrices: Any, covariances: Any, joint: Any, threshold: Any, upper: Any
 ) -> CensoredSensors:
-    """All sensors with as many channels as the largest has; the others' last ones are absent.
+    """Return sensors with the channels of the largest; the last channels of the others are absent.
 
-    ``joint`` is the covariance of all channels of all sensors, or ``None``: then ``covariances``
-    are theirs, and noises of different sensors are independent. A sensor whose own covariance R is
-    not diagonal reports F⁻¹ y with F Fᵀ = R.
+    A sensor whose own covariance R is not diagonal reports F⁻¹ y with F Fᵀ = R.
+
+    Args:
+        states: number of states n.
+        matrices: C of each sensor, (channels, n) or one row (n,).
+        covariances: R of each sensor, for independent sensors.
+        joint: covariance of all channels of all sensors, or None.
+        threshold: lower limits: one number, one per sensor, or a list for each sensor.
+        upper: upper limits, in the same form.
 
     Raises:
-        ConfigurationError: a value that is not allowed, or censoring where noises are correlated.
+        ConfigurationError: a value that is not allowed, or censoring of correlated sensors.
     """
     rows = _matrices(matrices, states)
     sizes = [len(row) for row in rows]
@@ -92,7 +98,7 @@ def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
 
 
 def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
-    """Limits (sensors, m); ``none`` stands for no limit, as of channels that are absent."""
+    """Return limits (sensors, m); absent channels have the limit ``none``."""
     item = _dimensions(values) == 0
     each = [values] * len(sizes) if item else _each(name, values, "a number or a list", len(sizes))
     result = np.full((len(sizes), max(sizes)), none)
@@ -103,11 +109,7 @@ def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
 
 
 def _each(name: str, value: Any, kind: str, count: int | None = None) -> list[Any]:
-    """What is given for each sensor.
-
-    Raises:
-        ConfigurationError: no list, an empty one, or another number of sensors.
-    """
+    """Return the entry of each sensor."""
     listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim > 0)
     if not listed or not len(value) or (count is not None and len(value) != count):
         many = "each sensor" if count is None else f"each of the {count} sensors"
@@ -116,7 +118,7 @@ def _each(name: str, value: Any, kind: str, count: int | None = None) -> list[An
 
 
 def _dimensions(value: Any) -> int:
-    """How deep a value is nested, by its first entries: ragged ones have no shape."""
+    """Return the depth of a nested value, by its first entries."""
     if isinstance(value, np.ndarray):
         return value.ndim
     depth = 0

@@ -1,4 +1,4 @@
-"""Options of environments whose nodes get the fused estimate back: filters and fusion rule."""
+"""Options of environments with feedback of the fused estimate: filters and fusion rule."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ class FeedbackOptions(PaperOptions):
 
 @dataclass(frozen=True)
 class Filter:
-    """A row of a table of filters: its class, and the centre that it makes of options and sensors.
+    """A row of a table of filters: its class, and the function that makes its centre.
 
-    The docstring of ``kind`` has meaning, equation, assumption and source. ``own`` are options that
-    belong to this filter alone; elsewhere they are ``None``. ``nodes`` says whether there are nodes
-    to be joined; without, the options of their fusion are ``None``.
+    The docstring of ``kind`` has meaning, equation, assumption and source. ``own`` are options of
+    this filter only; for other filters they are ``None``. ``nodes`` says whether the filter has
+    nodes; without nodes the options of their fusion are ``None``.
     """
 
     kind: type
@@ -67,22 +67,28 @@ class Filter:
 
 
 def at_the_nodes(kind: Any) -> Filter:
-    """The row of a node filter's class that has no options of its own."""
+    """Return the row of a node filter without options of its own."""
     return Filter(kind, lambda options, sensors: feedback_centre(options, kind(sensors)))
 
 
 def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
-    """The class of each filter of a table."""
+    """Return the class of each filter of a table."""
     return {name: row.kind for name, row in filters.items()}
 
 
 def make_centre(
     kind: str, filters: Mapping[str, Filter], options: FeedbackOptions, sensors: CensoredSensors
 ) -> Centre:
-    """The centre of the option ``filter``, by a table of filters.
+    """Return the centre of the option ``filter``.
+
+    Args:
+        kind: the filter's name.
+        filters: the table of filters.
+        options: options of the environment.
+        sensors: the sensors.
 
     Raises:
-        ConfigurationError: an unknown filter, or an option that is not the filter's.
+        ConfigurationError: an unknown filter, or an option of another filter.
     """
     choice("filter", kind, filters)
     for name, row in filters.items():
@@ -100,13 +106,19 @@ def make_system(
     model: LinearPlant | None = None,
     random_start: bool = False,
 ) -> CensoredSystem:
-    """Return the system of a plant and a centre, whose filters believe in ``model``.
+    """Return the system of a plant and a centre.
 
-    By default the model is the plant. Observed variances are relative to the open loop after
-    ``reference_horizon`` steps.
+    Args:
+        options: options of the environment.
+        plant: the true plant.
+        centre: nodes and centre.
+        state_names: names of the states.
+        reference_horizon: steps without transmissions whose variances scale observed variances.
+        model: the plant that the filters assume, by default ``plant``.
+        random_start: whether the initial mean has a random direction.
 
     Raises:
-        ConfigurationError: a departure of the truth that is not allowed, or can change nothing.
+        ConfigurationError: a departure of the truth that is not allowed, or has no effect.
     """
     absent = ("true_threshold_shift",) if centre.sensors.unlimited else ()
     nature = Nature.create(options, (*plant.unmoved, *absent))
@@ -130,12 +142,19 @@ def memory_filter_system(
     options: FeedbackOptions,
     sensors: CensoredSensors,
 ) -> CensoredSystem | None:
-    """The same plant with the filter of the option ``memory_filter``; ``None`` is the system's own.
+    """Return the system with the filter of the option ``memory_filter``, or ``system`` itself.
 
-    It takes the options of the system's filter where it has the same, and defaults elsewhere.
+    Its options are the system's own where both filters have them, and otherwise defaults.
+
+    Args:
+        system: the system.
+        kind: name of the memory's filter, or None.
+        filters: the table of filters.
+        options: options of the environment.
+        sensors: the sensors.
 
     Raises:
-        ConfigurationError: an unknown filter, or one that lacks an option.
+        ConfigurationError: an unknown filter, or a missing option.
     """
     if kind is None:
         return None
@@ -147,10 +166,14 @@ def memory_filter_system(
 
 
 def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
-    """Nodes with this filter and the options' fusion.
+    """Return nodes with this filter and the options' fusion.
+
+    Args:
+        options: options of the environment.
+        node: the nodes' filter.
 
     Raises:
-        ConfigurationError: a rule that does not fit, or an option that is not the rule's.
+        ConfigurationError: a rule that does not fit, or an option of another rule.
     """
     sensors = node.sensors.count
     kind = "federated" if options.fusion is None else options.fusion
@@ -165,36 +188,48 @@ def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
 
 
 def stochastic_centre(values: FeedbackOptions, sensors: CensoredSensors) -> Centre:
-    """The centre of ``filter="stochastic"``.
+    """Return the centre of ``filter="stochastic"``.
+
+    Args:
+        values: options of the environment.
+        sensors: the sensors.
 
     Raises:
-        ConfigurationError: no weight or one that is not allowed, or an option that does not fit.
+        ConfigurationError: a weight that is missing or not allowed, or an option that does not fit.
     """
     return feedback_centre(values, StochasticEventFilter.create(sensors, values.stochastic_weight))
 
 
 def stochastic_defaults(options: FeedbackOptions) -> dict[str, dict[str, Any]]:
-    """The scenario's parameters of the policy ``stochastic_event``, if the filter knows it."""
+    """Return the parameters of the policy ``stochastic_event``, if the filter uses it."""
     if options.stochastic_weight is None:
         return {}
     return {"stochastic_event": {"weight": plain_options(options.stochastic_weight)}}
 
 
 def assumed_density_centre(options: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:
-    """The centre of ``filter="adf"``.
+    """Return the centre of ``filter="adf"``.
+
+    Args:
+        options: options of the environment.
+        sensors: the sensors.
 
     Raises:
-        ConfigurationError: an option of the nodes' fusion, for there are no nodes.
+        ConfigurationError: an option of the nodes' fusion.
     """
     refuse_fusion(options, "adf")
     return SequentialCentre(AssumedDensityFilter(sensors))
 
 
 def refuse_fusion(options: FeedbackOptions, kind: str) -> None:
-    """Whether a filter of this name at the centre is asked to join nodes.
+    """Refuse options of the nodes' fusion for a filter without nodes.
+
+    Args:
+        options: options of the environment.
+        kind: the filter's name.
 
     Raises:
-        ConfigurationError: an option of the nodes' fusion, for there are no nodes.
+        ConfigurationError: such an option is set.
     """
     belongs = "a filter with nodes (here the centre takes the measurements itself)"
     _refuse(options, _OF_FUSION, f"filter={kind!r}", belongs)

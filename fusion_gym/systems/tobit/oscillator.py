@@ -54,22 +54,21 @@ _FILTERS = {
 
 @dataclass(frozen=True)
 class TobitOscillatorOptions(FeedbackOptions):
-    """An oscillator measured by three sensors that see nothing below a threshold.
+    """An oscillator measured by three sensors that are censored below a threshold.
 
-    A two-dimensional rotation by 0.052 π a step, driven by noise. Three sensors measure both states
+    The plant is a rotation by 0.052 π a step, driven by noise. Three sensors measure both states
     with noise of variance 0.5 and report max(z, 0) of each component. At every step the policy
-    requests transmissions; the bucket (5 tokens a step, 30 at most, 3 a transmission) grants or
-    denies; each node runs a Tobit Kalman filter on what got through, and the centre fuses the three
-    and feeds the result back.
+    requests transmissions. The bucket (5 tokens a step, 30 at most, 3 a transmission) grants or
+    denies. Each node runs a Tobit Kalman filter on its deliveries; the centre fuses the three and
+    feeds the result back.
 
     Starting state: x₀ ~ N((5, 0), 0.1 I), or with ``random_start=True`` about a random point at the
-    same distance, known to the filters. The first measurement is known to the centre free of
-    charge.
+    same distance, known to the filters. The centre receives the first measurement without charge.
 
-    The defaults are the paper's Section 4. Not given in the paper, our choice:
+    The defaults are the paper's Section 4. The paper does not give, and we chose:
     ``initial_covariance``, ``information_shares`` (equal), ``horizon``. The text gives x₀ = (5, 0),
-    which we take as the mean. The trigger's thresholds (0.1, 0.2, 0.3) and decays (0.1, 0.2, 0.1)
-    are repeated in turn for other numbers of sensors.
+    which we use as the mean. Other numbers of sensors repeat the trigger's thresholds
+    (0.1, 0.2, 0.3) and decays (0.1, 0.2, 0.1).
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
@@ -123,11 +122,7 @@ class TobitOscillatorOptions(FeedbackOptions):
 
 
 def build_tobit(options: TobitOscillatorOptions) -> Scenario:
-    """The scenario of these options, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
     plant = _plant(options)
     sensors = CensoredSensors.create(
@@ -182,7 +177,7 @@ def _centre(choice: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
 
 
 def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
-    """The filter of the paper, with its constants and the trigger's Ξ."""
+    """Return the paper's filter, with its constants and the trigger's Ξ."""
     constants = BoundConstants.create(options.bound_epsilon)
     if np.min(options.bound_epsilon) < _SMALLEST_EPSILON:
         raise validation.refusal(
@@ -200,7 +195,7 @@ def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> 
 
 
 def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> None:
-    """The bound of the event error grows by a factor a step, which may be above one."""
+    """Refuse a horizon over which the bound of the event error overflows."""
     reached = error.at(np.array([float(options.horizon)]))
     if not np.all(reached <= _LARGEST_EVENT_ERROR):
         names = ("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial")
@@ -213,7 +208,7 @@ def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> Non
 
 
 def _trigger(options: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
-    """Parameters of the dynamic event trigger, one number a sensor."""
+    """Return the parameters of the dynamic event trigger, one number per sensor."""
     arguments: dict[str, Any] = {
         "threshold": options.trigger_threshold,
         "decay": options.trigger_decay,

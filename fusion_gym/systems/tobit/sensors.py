@@ -21,17 +21,16 @@ _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in it
 class CensoredSensors:
     """y = clip(C x + v, τ, υ) by component, v ~ N(0, diag(R)), for several sensors of equal size.
 
-    A component that a sensor does not have is always zero: its row of C is, it is not censored, and
-    ``noise_deviation``, elsewhere √R, is zero there. ``deviation`` is √R, ``uncensored`` marks
-    lower thresholds of minus infinity, which ``finite_threshold`` replaces by zero; ``two_sided``
-    says whether any upper threshold is finite, and ``finite_upper`` replaces those that are not by
-    zero. ``noise_correlation`` is a factor L of the noises' correlations L Lᵀ, over the channels of
-    all sensors one after another, ``None`` where all are independent.
+    A component that a sensor does not have is always zero: its row of C and its ``noise_deviation``
+    are zero, and it is not censored. ``deviation`` is √R. ``uncensored`` marks lower thresholds of
+    minus infinity, which ``finite_threshold`` replaces by zero; ``two_sided`` says whether any
+    upper threshold is finite, and ``finite_upper`` replaces infinite ones by zero.
+    ``noise_correlation`` is a factor L of the noises' correlations L Lᵀ, over the channels of all
+    sensors in their order; ``None`` for independent noises.
 
     Shapes: ``measurement_matrix`` C (sensors, m, n, 1), ``variance`` R (sensors, m, 1),
-    ``threshold`` τ and ``upper`` υ (sensors, m, 1), in the unit of the measurement, minus and plus
-    infinity where a component is not censored on that side; ``noise_correlation`` L
-    (sensors·m, sensors·m, 1). Build one with :meth:`create`.
+    ``threshold`` τ and ``upper`` υ (sensors, m, 1), in the unit of the measurement, infinite where
+    a component is not censored on that side; ``noise_correlation`` L (sensors·m, sensors·m, 1).
 
     Source: tobit_token_bucket, equations (1) and (2); round_robin_tobit, equations (2) and (6).
     """
@@ -58,13 +57,19 @@ class CensoredSensors:
         upper: ArrayLike = np.inf,
         present: NDArray[np.bool_] | None = None,
     ) -> CensoredSensors:
-        """Check plain arrays: C (sensors, m, states); R, τ and υ broadcast to (sensors, m).
+        """Return sensors from arrays without a batch axis.
 
-        ``present`` (sensors, m) are the components that the sensors have, by default all.
+        Args:
+            measurement_matrix: C (sensors, m, states).
+            variance: R, broadcast to (sensors, m).
+            threshold: τ, broadcast to (sensors, m).
+            states: number of states.
+            upper: υ, broadcast to (sensors, m).
+            present: the components (sensors, m) that the sensors have, by default all.
 
         Raises:
             ConfigurationError: a wrong shape, a variance <= 0, a lower threshold that is not below
-                the upper one, or an entry that is not finite (but for infinite thresholds).
+                the upper one, or an entry that is not finite (infinite thresholds are).
         """
         name, most = "measurement_matrices", validation.MOST_SENSORS
         matrix = validation.array(name, measurement_matrix, (None, None, states), most)
@@ -109,9 +114,12 @@ class CensoredSensors:
         return self.count * self.size
 
     def measure(self, state: Array, noise: Array, departure: Array | None = None) -> Array:
-        """Censored measurements (sensors, m, N) of the state (n, N) from normals (sensors·m, N).
+        """Return the censored measurements (sensors, m, N).
 
-        A ``departure`` (4, N) moves the thresholds that the sensors have.
+        Args:
+            state: (n, N).
+            noise: standard normals (sensors·m, N).
+            departure: (4, N), or None; it moves the thresholds.
         """
         shape = (self.count, self.size, noise.shape[-1])
         if self.noise_correlation is not None:
@@ -125,14 +133,14 @@ class CensoredSensors:
 
     @property
     def stacked_matrix(self) -> Array:
-        """C (sensors·m, n, 1) of all sensors, one after another."""
+        """C (sensors·m, n, 1) of all sensors in their order."""
         return self.measurement_matrix.reshape(-1, *self.measurement_matrix.shape[2:])
 
     @functools.cached_property
     def noise_factor(self) -> Array:
-        """F (sensors·m, sensors·m, 1) with F Fᵀ the covariance of all noises, as filters have it.
+        """F (sensors·m, sensors·m, 1) with F Fᵀ the filters' covariance of all noises.
 
-        That of a component that a sensor does not have counts as 1, of its own.
+        The noise of an absent component is independent, of variance 1.
         """
         deviation = self.deviation.reshape(-1, 1, 1)
         factor = self.noise_correlation
@@ -140,7 +148,7 @@ class CensoredSensors:
 
     @functools.cached_property
     def noise_covariance(self) -> Array:
-        """R (sensors·m, sensors·m, 1) of all noises, as filters have it."""
+        """R (sensors·m, sensors·m, 1) of all noises in the filters."""
         factor = self.noise_factor
         return linalg.symmetrise(linalg.matmul(factor, linalg.transpose(factor)))
 
@@ -151,9 +159,9 @@ class CensoredSensors:
 
     @functools.cached_property
     def resolution(self) -> Array:
-        """Variance (n, 1) that one look at all sensors would leave of each state alone.
+        """Variance (n, 1) of each state from one measurement of all sensors, 1/Σ C² R⁻¹.
 
-        1/Σ C² R⁻¹, of a state that no sensor measures the largest of the others.
+        For a state that no sensor measures it is the largest of the others.
         """
         information = (self.measurement_matrix**2 / self.variance[:, :, None]).sum((0, 1))
         observed = information > 0.0
@@ -161,10 +169,10 @@ class CensoredSensors:
         return np.where(observed, values, values.max() if observed.any() else np.inf)
 
     def regular(self, covariance: Array) -> Array:
-        """A regular covariance (n, n, N) that is a bound of this one, larger by its rounding.
+        """Return a regular bound of the covariance (n, n, N), larger by its rounding.
 
-        No variance is above 10²⁶ resolutions: that much larger than any noise, an update depends
-        on the shape alone.
+        No variance exceeds 10²⁶ resolutions: beyond, an update depends on the covariance's shape
+        only.
         """
         result = linalg.add_diagonal(
             covariance, len(covariance) * _RIDGE * linalg.diagonal(covariance)
@@ -176,6 +184,6 @@ class CensoredSensors:
         return result * linalg.outer(scale, scale)
 
     def censored(self, measurement: Array) -> NDArray[np.bool_]:
-        """Which components (sensors, m, N) lie at a threshold."""
+        """Return which components (sensors, m, N) lie at a threshold."""
         below = measurement <= self.threshold
         return below | (measurement >= self.upper) if self.two_sided else below

@@ -34,13 +34,13 @@ _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clippe
 
 @dataclass(slots=True)
 class CensoredState:
-    """Everything about N runs at one time; shapes with n states, l sensors, m components.
+    """The state of N runs at one time; n states, l sensors, m components.
 
     ``truth`` (n, N) · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered
     measurement · ``age`` (l, N), steps since then · ``time`` (N,), the step in the episode ·
-    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``prediction``,
-    what is expected of the measurements · ``mean`` (n, N), ``covariance`` (n, n, N), the fused
-    posterior · ``departure`` (4, N) of the truth from the model, if it departs.
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``prediction``
+    of the measurements · ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior ·
+    ``departure`` (4, N) of the truth from the model, if any.
     """
 
     truth: Array
@@ -67,16 +67,15 @@ SIGNALS = (
 
 @dataclass(frozen=True)
 class CensoredSystem(System[CensoredState]):
-    """Joins a plant, censored sensors, and a centre with or without nodes.
+    """A plant, censored sensors, and a centre with or without nodes.
 
-    ``model`` is the plant that the filters believe in; the true one is ``plant``, from which
-    ``nature`` makes it depart, and the sensors with it.
+    ``model`` is the plant that the filters assume. The true plant is ``plant``, modified by
+    ``nature``, which also modifies the sensors.
 
-    ``random_start`` draws the initial mean, known to the filters, in a uniformly random direction
-    with the length of the plant's initial mean; for the oscillator that is a random phase.
-    ``scale`` (n,) are the magnitudes by which observed state estimates are divided, and
-    ``reference`` (n,) the variances against which observed variances are taken. With
-    ``known_start`` the estimate begins with the first measurement of every sensor.
+    ``random_start`` draws the direction of the initial mean uniformly; the filters know it. For the
+    oscillator that is a random phase. ``scale`` (n,) divides observed state estimates and
+    ``reference`` (n,) observed variances. With ``known_start`` the estimate begins with the first
+    measurement of every sensor.
     """
 
     plant: LinearPlant
@@ -103,7 +102,7 @@ class CensoredSystem(System[CensoredState]):
 
     @property
     def noise_channels(self) -> int:
-        """Normals of one step: process noise, then the sensors' noises."""
+        """Normals of one step: process noise, then the sensors'."""
         return self.plant.noise_channels + self.centre.sensors.noise_channels
 
     @property
@@ -115,8 +114,8 @@ class CensoredSystem(System[CensoredState]):
     def offers(self, capability: str) -> bool:
         """See :class:`System`; Kalman filters without censoring have a covariance cycle.
 
-        With federated fusion, or one filter at the centre, the covariances are then the actual
-        ones, if ``model`` is the plant; with covariance intersection they are bounds.
+        With federated fusion, or one filter at the centre, the covariances are then the actual ones
+        if ``model`` is the plant; with covariance intersection they are bounds.
         """
         if capability == "covariance_cycle":
             return self.centre.predictable
@@ -126,12 +125,12 @@ class CensoredSystem(System[CensoredState]):
 
     @property
     def covariance_cycle(self) -> int:
-        """1: the recursion never changes."""
+        """1: the recursion of the covariances does not depend on time."""
         return 1
 
     @property
     def observation(self) -> tuple[Block, ...]:
-        """Blocks of the observation, without those of censoring where nothing is censored."""
+        """Blocks of the observation, without those of censoring if nothing is censored."""
         sensors, nodes = self.centre.sensors, numbered(self.sensor_count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
         new = partial(own, knowledge="own", limit=_RANGE)
@@ -174,9 +173,10 @@ class CensoredSystem(System[CensoredState]):
 
     @property
     def censored_beyond(self) -> dict[int, tuple[float, float]]:
-        """Where states are censored, for pictures: lowest and highest value that is seen.
+        """Lowest and highest uncensored value of states, by their number, for pictures.
 
-        Of states that some sensors measure alone, by their number; the widest where they differ.
+        It covers states that a sensor measures separately; the widest interval where sensors
+        differ.
         """
         result: dict[int, tuple[float, float]] = {}
         sensors = self.centre.sensors
@@ -192,7 +192,7 @@ class CensoredSystem(System[CensoredState]):
         return result
 
     def start(self, noise: Array) -> CensoredState:
-        """Time 0: the state is drawn and every first measurement is known, free of charge."""
+        """Draw the initial state; every first measurement is known without charge."""
         n, sensors = self.plant.size, self.centre.sensors
         noise, departure = self.nature.begin(noise)
         mean = np.broadcast_to(self.plant.initial_mean, (n, noise.shape[-1])).copy()
@@ -225,7 +225,7 @@ class CensoredSystem(System[CensoredState]):
         return replace(result, prediction=None)
 
     def sense(self, state: CensoredState, noise: Array) -> CensoredState:
-        """The plant moves, the sensors measure, centre and nodes predict.
+        """Move the plant, measure, and predict at centre and nodes.
 
         Source: tobit_token_bucket, equations (1), (2), (21), (23), (29).
         """
@@ -246,7 +246,7 @@ class CensoredSystem(System[CensoredState]):
         )
 
     def deliver(self, state: CensoredState, granted: NDArray[np.bool_]) -> CensoredState:
-        """Nodes and centre update with what the network granted (sensors, N).
+        """Update nodes and centre with the granted (sensors, N) measurements.
 
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
@@ -263,7 +263,7 @@ class CensoredSystem(System[CensoredState]):
         )
 
     def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals named in ``SIGNALS``."""
+        """Return the signals of ``SIGNALS``."""
         expectation, deviation = sensed(state.prediction)[:2]
 
         @functools.cache
@@ -292,24 +292,24 @@ class CensoredSystem(System[CensoredState]):
         return now - usual
 
     def visible(self, state: CensoredState) -> CensoredState:
-        """The state without the truth and its departure; nothing else is hidden."""
+        """Return the state without the truth and its departure."""
         return replace(state, truth=np.full_like(state.truth, np.nan), departure=None)
 
     @property
     def imagination_channels(self) -> int:
-        """One for each state."""
+        """Number of states."""
         return self.plant.size
 
     def imagine(
         self, state: CensoredState, mean: Array, covariance: Array, noise: Array
     ) -> CensoredState:
-        """The state with a truth drawn by what is believed, which moves as the model says."""
+        """Return the state with a truth drawn from N(mean, covariance), without departure."""
         return replace(state, truth=linalg.draw_normal(mean, covariance, noise), departure=None)
 
     def adopt(
         self, state: CensoredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]
     ) -> CensoredState:
-        """The centre, and by its feedback the nodes, go on from this estimate in ``runs`` (N,)."""
+        """Replace the estimate of the centre, and by feedback of the nodes, in ``runs`` (N,)."""
         return replace(
             state,
             mean=np.where(runs, mean, state.mean),
@@ -317,14 +317,14 @@ class CensoredSystem(System[CensoredState]):
         )
 
     def local_means(self, state: CensoredState) -> Array:
-        """The nodes' posterior means (sensors, n, N) before the feedback."""
+        """Return the nodes' posterior means (sensors, n, N) before the feedback."""
         if state.prediction is None:
             return np.broadcast_to(state.mean, (len(state.age), *state.mean.shape))
         prior, granted = (state.prior_mean, state.prior_covariance), state.age == 0.0
         return self.centre.local_means(*prior, state.prediction, state.measurement, granted)
 
     def open_loop(self, horizon: int) -> Array:
-        """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
+        """Return the mean error variance (n,) of predictions over t = 1..horizon."""
         return self.plant.open_loop(horizon)
 
     def rounding(self, horizon: int) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The Tobit Kalman filter, and the centre's filter that takes censored values for what they say."""
+"""The Tobit Kalman filter, and the centre's assumed-density filter of censored values."""
 
 from dataclasses import dataclass
 
@@ -14,9 +14,10 @@ _FAR = 50.0  # a threshold this many deviations away never censors
 
 
 def expect_censored(sensors: CensoredSensors, mean: Array) -> Expectation:
-    """Moments of a censored measurement, given the predicted state (sensors, n, N).
+    """Return the moments of a censored measurement from predicted states (sensors, n, N).
 
     With ζ = (τ - C x̂)/√R: q = 1 - Φ(ζ), λ = φ(ζ)/q, ŷ = q (C x̂ + λ √R) + (1 - q) τ.
+
     Source: tobit_token_bucket, equations (5)-(7) and (23).
     """
     latent = linalg.matvec(sensors.measurement_matrix, mean)
@@ -24,7 +25,7 @@ def expect_censored(sensors: CensoredSensors, mean: Array) -> Expectation:
 
 
 def censored_moments(sensors: CensoredSensors, latent: Array, deviation: Array) -> Expectation:
-    """Moments of clip(z, τ, υ) for z ~ N(latent, deviation²), both (sensors, m, N).
+    """Return the moments of clip(z, τ, υ) for z ~ N(latent, deviation²), both (sensors, m, N).
 
     ``noise_variance`` is the total variance of the censored value; ``hazard`` and
     ``truncated_variance`` are mean and variance of the standardised z given that it is uncensored.
@@ -47,10 +48,11 @@ def censored_moments(sensors: CensoredSensors, latent: Array, deviation: Array) 
 
 
 def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array) -> Expectation:
-    """With a, b the probabilities below and above and p between: y has mean a τ + b υ + p centre.
+    """Return the moments for thresholds on both sides.
 
-    The variance is that within the interval and, by the law of total variance, that between the
-    three values τ, υ and centre. Source: round_robin_tobit, equations (9), (12)-(14), (20).
+    With probabilities a below, b above and p between, y has mean a τ + b υ + p centre. The variance
+    is, by the law of total variance, that within the interval and that of the three values τ, υ and
+    centre. Source: round_robin_tobit, equations (9), (12)-(14), (20).
     """
     low = (sensors.threshold - latent) / deviation
     high = (sensors.upper - latent) / deviation
@@ -77,7 +79,7 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
 
 @dataclass(frozen=True)
 class TobitKalmanFilter(KalmanFilter):
-    r"""Tobit Kalman filter; when nothing arrives the prior is the posterior.
+    r"""Tobit Kalman filter; without a delivery the prior is the posterior.
 
     S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :func:`expect_censored`.
 
@@ -153,10 +155,7 @@ class AssumedDensityFilter:
     sensors: CensoredSensors
 
     def expect(self, mean: Array, root: Array) -> Expectation:
-        """Moments of the measurements (sensors, m, N) under the prior N(mean, G Gᵀ).
-
-        ``mean`` (n, N) and ``root`` G (n, n, N).
-        """
+        """Return the moments of the measurements (sensors, m, N) under the prior N(mean, G Gᵀ)."""
         matrix = self.sensors.measurement_matrix
         latent = linalg.matvec(matrix, mean)
         spread = np.square(linalg.matmul(matrix, root)).sum(-2) + self.sensors.variance
@@ -165,7 +164,7 @@ class AssumedDensityFilter:
     def update(
         self, mean: Array, root: Array, measurement: Array, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Mean (n, N) and root (n, n, N) after the granted (sensors, N) measurements."""
+        """Return mean (n, N) and root (n, n, N) after the granted (sensors, N) measurements."""
         for sensor in np.flatnonzero(granted.any(-1)).tolist():
             for component in range(self.sensors.size):
                 value, taken = measurement[sensor, component], granted[sensor]
@@ -173,10 +172,10 @@ class AssumedDensityFilter:
         return mean, root
 
     def expected_covariance(self, mean: Array, root: Array) -> Array:
-        """Expected posterior covariance (sensors, n, n, N) if one sensor alone delivers.
+        """Return the expected covariance (sensors, n, n, N) after a single sensor's delivery.
 
-        Component by component, each with the share of its variance that the possibly censored
-        measurement is expected to explain; exact for sensors of one component.
+        The update runs by component, each with the expected share of variance that the measurement
+        explains; it is exact for sensors of one component.
         """
         matrix, noise = self.sensors.measurement_matrix, self.sensors.variance
         latent = linalg.matvec(matrix, mean)
@@ -221,5 +220,5 @@ class AssumedDensityFilter:
 
 
 def _loss(distance: Array) -> Array:
-    """h (h - t) = 1 - variance of a standard normal beyond t: what a censored value explains."""
+    """Return h (h - t) = 1 - variance of a standard normal beyond t."""
     return 1.0 - gaussian.truncated_variance(distance)

@@ -1,6 +1,8 @@
 """The joint input-state filter that holds the last measurement, with a bound of its covariance.
 
 Source: unknown_input, equations (8)-(20), in a form whose bound holds.
+
+Source: unknown_input, equations (8)-(20), in a form whose bound holds.
 """
 
 from __future__ import annotations
@@ -21,20 +23,20 @@ _UNBOUNDED = 1e60  # a bound beyond this is growing without limit; the gains hav
 
 @dataclass(frozen=True)
 class BoundTables:
-    r"""The paper's filter, corrected: its gain minimises a bound, for all runs alike.
+    r"""The paper's filter, corrected: its gain minimises a bound that all runs share.
 
-    Tables of every node at the times 0 to T. Nothing in them depends on the data or on what was
-    sent: when nothing arrives the node takes the last measurement for the present one, and |σ|² <=
-    ρ̄ bounds what that does. With ε the factor of Young's inequality, Φ = (1 + ε)(𝒜 Ξ 𝒜ᵀ + 𝒲) and R
-    = (1 + ε) V + (1 + 1/ε) ρ̄ I.
+    The tables cover every node at the times 0 to T. They depend neither on the data nor on the
+    deliveries: without a delivery the node uses the last measurement as the present one, and |σ|²
+    <= ρ̄ bounds the resulting error. With ε the factor of Young's inequality, Φ = (1 + ε)(𝒜 Ξ 𝒜ᵀ +
+    𝒲) and R = (1 + ε) V + (1 + 1/ε) ρ̄ I.
 
     ``gain`` 𝒢 (l, s, m, T + 1), ``covariance`` (l, s, s, T + 1), the bound after the update, and
-    ``delivered`` (l, s, s, T + 1), the same if the present measurement is known to be new (no
-    held difference enters in this step). At time 0 there is no update. ``radius`` (l,) is the
-    spectral radius of √(1 + ε) (I - N C) 𝒜 at the last time: below 1 the bound stays finite.
+    ``delivered`` (l, s, s, T + 1), the bound after a delivery in this step, without a held
+    difference. At time 0 there is no update. ``radius`` (l,) is the spectral radius of √(1 + ε) (I
+    - N C) 𝒜 at the last time: below 1 the bound stays finite.
 
     The bound holds under a trigger that sends whenever |σ|² > ρ̄ and whose requests are granted.
-    For a policy without that guarantee, and after a request that was denied, it is void.
+    For other policies, and after a denial, it does not hold.
 
     Equation:
         $$
@@ -79,10 +81,17 @@ class BoundTables:
         young_factor: ArrayLike,
         times: int,
     ) -> BoundTables:
-        """Tables for the times 0 to ``times``; ρ̄ and ε are one number or one a sensor.
+        """Return tables for the times 0 to ``times``.
+
+        Args:
+            joint: the gain of state and input.
+            model: the model of the input.
+            rho_bar: ρ̄ in [0, 1]: one number, or one per sensor.
+            young_factor: ε > 0: one number, or one per sensor.
+            times: the last time T.
 
         Raises:
-            ConfigurationError: ρ̄ outside [0, 1], ε <= 0, or a bound that grows without limit.
+            ConfigurationError: ρ̄ or ε outside these limits, or a bound that grows without limit.
         """
         sensors = joint.sensors
         count = sensors.count

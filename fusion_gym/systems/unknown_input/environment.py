@@ -51,21 +51,21 @@ FILTERS: dict[str, type] = {
 
 @dataclass(frozen=True)
 class UnknownInputOptions(PaperOptions):
-    """Two carts, tied by springs, under a force that nobody knows, seen in part by three sensors.
+    """Two carts, tied by springs, under an unknown force, measured in part by three sensors.
 
-    The state is the positions and velocities of two carts; the force on the first is unknown to
-    filters and policies and drawn anew in every episode. The carts are sampled every second small
-    step. Each node estimates the state and, one sampling instant late, the force, from what its
-    sensor transmitted; the centre fuses the nodes by covariance intersection. Nothing is fed back.
+    The state is the positions and velocities of two carts. The force on the first is unknown to
+    filters and policies; every episode draws it. The carts are sampled every second small step.
+    Each node estimates the state and, one sampling instant late, the force from the deliveries of
+    its sensor. The centre fuses the nodes by covariance intersection. Nothing is fed back.
     ``example="paper"`` gives the paper's system instead: two states, two inputs, two sensors, and
-    its own filter. The inputs stand behind the states wherever states are listed, and the reward
-    weighs their errors by ``input_weight``.
+    its own filter. Lists of states end with the inputs, and the reward weighs the inputs' errors by
+    ``input_weight``.
 
     Starting state: x₀ ~ N(0, 0.1 I), or, in the paper's example, uniform on [0.16, 0.18]. The
     measurement at time 0 has been delivered.
 
     ``None`` stands for the number of the chosen ``example``, which
-    :mod:`fusion_gym.systems.unknown_input.examples` lists; a number that is given goes before it.
+    :mod:`fusion_gym.systems.unknown_input.examples` lists.
     """
 
     filters: ClassVar[Mapping[str, type]] = FILTERS
@@ -135,11 +135,7 @@ class UnknownInputOptions(PaperOptions):
 
 
 def build_unknown(options: UnknownInputOptions) -> Scenario:
-    """The scenario of these options, checked before anything runs.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the scenario of these options."""
     options = _with_example(options)
     horizon = validation.horizon(options.horizon)
     plant = _plant(options)
@@ -187,9 +183,9 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
 def _remembering(
     options: UnknownInputOptions, system: UnknownInputSystem, sensors: InputSensors, horizon: int
 ) -> UnknownInputSystem | None:
-    """The system with the filter of ``memory_filter``; ``None`` is its own.
+    """Return the system with the filter of ``memory_filter``, or the system's own for ``None``.
 
-    With the paper's filter, which minimises a bound, the random walk's.
+    The paper's filter, which minimises a bound, uses the random walk's.
     """
     kind = options.memory_filter
     if kind is None:
@@ -202,7 +198,7 @@ def _remembering(
 
 
 def _with_example(options: UnknownInputOptions) -> UnknownInputOptions:
-    """The options with the example's numbers where none were given."""
+    """Return the options with the example's numbers in place of ``None``."""
     example = EXAMPLES[validation.choice("example", options.example, EXAMPLES)]
     numbers = {name: value for name, value in example.items() if name != "signals"}
     kind = options.input_signal
@@ -238,7 +234,7 @@ def _plant(options: UnknownInputOptions) -> UnknownInputPlant:
 
 
 def _given(value: ArrayLike | None) -> ArrayLike:
-    """A number that the example has filled in."""
+    """Return a number that the example has filled in."""
     assert value is not None, "the examples give every number"
     return value
 
@@ -306,7 +302,7 @@ def _nodes(
 
 
 def _trigger(options: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:
-    """Parameters of the adaptive threshold trigger, one number a sensor."""
+    """Return the parameters of the adaptive threshold trigger, one number per sensor."""
     names = ("rho_bar", "rho_initial", "adaptation")
     spread = {
         name: tuple(validation.spread(name, _given(getattr(options, name)), (sensors,)).tolist())

@@ -1,4 +1,4 @@
-"""The two filters of a state with an unknown input that predict where nothing arrives."""
+"""The two filters of a state with an unknown input that predict without a delivery."""
 
 from dataclasses import dataclass
 
@@ -14,11 +14,10 @@ from fusion_gym.systems.unknown_input.sensors import InputSensors
 class ExactInputStateFilter:
     r"""Exact unbiased filter of state and input, of minimum variance.
 
-    An update assumes nothing about the input that has just acted: its estimate comes from this
-    measurement alone. While every measurement arrives the covariance is therefore the actual one,
-    for every input. Where none arrives there is nothing to estimate the input from, and the node
-    predicts with the :class:`InputModel`; from then on its covariance is a claim that is as good
-    as the model.
+    An update assumes nothing about the input that has just acted: its estimate uses this
+    measurement only. If every measurement arrives, the covariance is therefore the actual one for
+    every input. Without a delivery the node predicts with the :class:`InputModel`; from then on its
+    covariance depends on the model's validity.
 
     Equation:
         $$
@@ -54,9 +53,9 @@ class ExactInputStateFilter:
 
     @np.errstate(all="ignore")
     def growth(self, horizon: int) -> Array:
-        """Factor (l,) by which a variance grows where the input hides a growing direction.
+        """Return the factor (l,) of a variance's growth where the input hides a growing direction.
 
-        The largest of deliveries in each step and in every second, 4th, 16th and 64th one. Of a
+        It is the largest over deliveries in each step and in every 2nd, 4th, 16th and 64th. For a
         state that is known at the start the unit is its largest variance of the first s steps.
         """
         periods, noise = np.array([1, 2, 4, 16, 64]), self.joint.sensors.covariance
@@ -73,11 +72,14 @@ class ExactInputStateFilter:
         return np.asarray((largest / np.where(unit > 0.0, unit, np.inf)).max((1, 2)))
 
     def update(self, posterior: Array, noise: Array) -> tuple[Array, Array]:
-        """Gain (l, s, m, N) and covariance (l, s, s, N) from the posterior one instant earlier.
+        """Return gain (l, s, m, N) and covariance (l, s, s, N).
 
-        ``posterior`` is (l, s, s, N), ``noise`` (l, m, m, 1) the covariance of the measurements.
-        The gain hides the input, so it may be applied to y - C x̂ with any prediction of the input
-        in x̂: the updated estimate is the same.
+        The gain hides the input: the updated estimate is the same for any prediction of the input
+        in x̂.
+
+        Args:
+            posterior: the covariance one instant earlier (l, s, s, N).
+            noise: covariance of the measurements (l, m, m, 1).
         """
         before = self.model.without_input(posterior)
         gain = self.joint.gain(before, noise)
@@ -88,9 +90,9 @@ class ExactInputStateFilter:
 class RandomWalkInputFilter:
     r"""Kalman filter of z = [x(k); d(k - 1)] under a model of the input, :class:`InputModel`.
 
-    Unlike the unbiased filters it uses what it knew of the input before, and it is optimal if the
-    input does follow the model. The actual input does not, so its covariance is a claim, not a
-    bound; how good a claim depends on the model's numbers.
+    Unlike the unbiased filters it uses its earlier estimate of the input, and it is optimal if the
+    input follows the model. The actual input does not, so its covariance is no bound; its accuracy
+    depends on the model's numbers.
 
     Equation:
         $$
@@ -120,9 +122,11 @@ class RandomWalkInputFilter:
     sensors: InputSensors
 
     def update(self, prior: Array, noise: Array) -> tuple[Array, Array]:
-        """Gain (l, s, m, N) and covariance (l, s, s, N) from prior (l, s, s, N) and noise.
+        """Return gain (l, s, m, N) and covariance (l, s, s, N).
 
-        ``noise`` (l, m, m, N or 1) is the covariance of what is taken for the measurement.
+        Args:
+            prior: (l, s, s, N).
+            noise: covariance of the measurement (l, m, m, N or 1).
         """
         n = self.model.size
         matrix = self.sensors.matrix

@@ -1,7 +1,9 @@
 """Covariance intersection of several nodes' estimates of a state and an input.
 
 State and input are fused separately, each by (24) with weights of the smallest trace (25). The
-two results' cross-covariance is not known and stands as zero.
+cross-covariance of the two results is unknown and set to zero.
+
+Source: unknown_input, equations (24)-(26).
 
 Source: unknown_input, equations (24)-(26).
 """
@@ -32,14 +34,14 @@ _FLOOR = 1e-3  # a tracked weight stays above, so that it can come back
 class NodeFusion(FusionRule):
     """The centre's rule for l nodes with n states and q inputs.
 
-    ``rule`` joins the ``states`` n entries of the nodes' states, and their inputs. Where it is
-    :class:`~fusion_gym.fusion.several.CovarianceIntersection` and ``tracked``, its weights near
-    the smallest trace may follow it from one time to the next (:func:`tracked_intersection`),
-    from those that :meth:`going_on` takes.
+    ``rule`` joins the ``states`` n entries of the nodes' states, and their inputs. With
+    :class:`~fusion_gym.fusion.several.CovarianceIntersection` and ``tracked``, its weights follow
+    the smallest trace from one time to the next (:func:`tracked_intersection`), starting from the
+    weights of :meth:`going_on`.
 
-    Covariance intersection gives a bound for every correlation of the nodes' errors, provided
-    that the nodes' covariances are bounds. Its inverse form does not, for the errors share
-    process noise.
+    Covariance intersection gives a bound for every correlation of the nodes' errors, provided that
+    the nodes' covariances are bounds. Its inverse form does not, because the errors share process
+    noise.
     """
 
     rule: FusionRule
@@ -48,11 +50,11 @@ class NodeFusion(FusionRule):
     weights: Array | None = None
 
     def start(self, nodes: int, runs: int) -> Array | None:
-        """Equal weights (l, N) where they are tracked."""
+        """Return equal weights (l, N) if weights are tracked."""
         return np.full((nodes, runs), 1.0 / nodes) if self.tracked else None
 
     def going_on(self, weights: Array | None) -> NodeFusion:
-        """The same rule from the last weights (l, N) on, if there are any."""
+        """Return the rule that starts from the last weights (l, N)."""
         return self if weights is None else replace(self, weights=weights)
 
     def fuse(
@@ -60,8 +62,7 @@ class NodeFusion(FusionRule):
     ) -> Fused:
         """See :class:`~fusion_gym.fusion.rules.FusionRule`, for means (l, s, N), s = n + q.
 
-        The covariance has zero blocks between state and input, and the weights are the state's,
-        if they are tracked.
+        The covariance has zero blocks between state and input. Tracked weights are the state's.
         """
         n, own = self.states, own_covariances(covariance)
         state = self._block(means[:, :n], own[:, :n, :n], active)
@@ -93,7 +94,7 @@ class NodeFusion(FusionRule):
 
 
 def _smallest_variance(mean: Array, covariance: Array) -> Fused:
-    """Covariance intersection of scalars: the smallest variance takes all, equals share."""
+    """Return the covariance intersection of scalars: the smallest variance, or equal shares."""
     smallest = covariance.min(0)
     selection = (covariance == smallest)[:, 0, 0]
     weights = selection / selection.sum(0)
@@ -103,13 +104,13 @@ def _smallest_variance(mean: Array, covariance: Array) -> Fused:
 
 @np.errstate(all="ignore")
 def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fused:
-    """Covariance intersection with weights that follow the smallest trace over time.
+    """Return the covariance intersection with weights that follow the smallest trace over time.
 
-    From the given weights (l, N) on, w_i ← w_i √tr(P Y_i P), normalised, with Y_i = P_i⁻¹ and
-    P = (Σ w_i Y_i)⁻¹, until the trace of P is within 1 % of its minimum: the gap is at most
-    max_i tr(P Y_i P) - tr P. At most four evaluations are made at a time; the search goes on at
-    the next. Every P on the way is a bound, since any weights give one. Where an estimate is nearly
-    singular the search is :func:`covariance_intersection_many`.
+    From the given weights (l, N), w_i ← w_i √tr(P Y_i P), normalised, with Y_i = P_i⁻¹ and P = (Σ
+    w_i Y_i)⁻¹, until the trace of P is within 1 % of its minimum: the gap is at most max_i tr(P Y_i
+    P) - tr P. A call makes at most four evaluations; the next call continues. Every P is a bound,
+    since any weights give one. For a nearly singular estimate the search is
+    :func:`covariance_intersection_many`.
 
     Args:
         mean: (l, n, N).

@@ -1,7 +1,12 @@
 """Joint estimation of a state and an unknown input: sensors, gain, covariance, input model.
 
-The estimated quantity is z(k) = [x(k); d(k - 1)], of length s = n + q: an input is seen only after
-it has acted, so its estimate comes one sampling instant late.
+The estimated quantity is z(k) = [x(k); d(k - 1)], of length s = n + q: an input becomes observable
+only after it has acted, so its estimate comes one sampling instant late.
+
+Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
+cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023); S.
+Gillijns and B. De Moor, "Unbiased minimum-variance input and state estimation for linear
+discrete-time systems", Automatica 43, 2007.
 
 Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023);
@@ -24,16 +29,16 @@ from fusion_gym.systems.unknown_input.sensors import InputSensors
 
 @dataclass(frozen=True)
 class JointGain:
-    """The unbiased gain of the smallest variance for [x(k); d(k - 1)], whatever the input was.
+    """The unbiased gain of the smallest variance for [x(k); d(k - 1)], for every input.
 
-    The gain 𝒢 = [N; L] (l, s, m, N) must not let the input through: 𝒢 C ℬ = [ℬ; I], which is (13)
-    and (14). All such gains are [ℬ; I] (C ℬ)⁺ + Z Uᵀ with free Z, and the smallest covariance has
-    Z = (T - [ℬ; I] (C ℬ)⁺ Ω) U (Uᵀ Ω U)⁻¹ with T = [Φ Cᵀ; 0], Φ the covariance of x(k) given the
-    past without its input, and Ω = C Φ Cᵀ + R. This equals L = ((Cℬ)ᵀ Ω⁻¹ Cℬ)⁻¹ (Cℬ)ᵀ Ω⁻¹ and
-    N = ℬ L + Φ Cᵀ U (Uᵀ Ω U)⁻¹ Uᵀ, but inverts nothing that is nearly singular. With as many
-    inputs as measurements U is empty and nothing is left to choose.
+    The gain 𝒢 = [N; L] (l, s, m, N) hides the input: 𝒢 C ℬ = [ℬ; I], which is (13) and (14). All
+    such gains are [ℬ; I] (C ℬ)⁺ + Z Uᵀ with free Z, and the smallest covariance has Z = (T - [ℬ; I]
+    (C ℬ)⁺ Ω) U (Uᵀ Ω U)⁻¹ with T = [Φ Cᵀ; 0], Φ the covariance of x(k) given the past without its
+    input, and Ω = C Φ Cᵀ + R. This equals L = ((Cℬ)ᵀ Ω⁻¹ Cℬ)⁻¹ (Cℬ)ᵀ Ω⁻¹ and N = ℬ L + Φ Cᵀ U (Uᵀ Ω
+    U)⁻¹ Uᵀ, without an inverse of a nearly singular matrix. With as many inputs as measurements U
+    is empty and the gain is unique.
 
-    ``sensors`` as above; ``onto`` [ℬ; I] (C ℬ)⁺ (l, s, m, 1).
+    ``onto`` is [ℬ; I] (C ℬ)⁺ (l, s, m, 1).
 
     Source: unknown_input, equations (8)-(14), (19), with (20) replaced by the minimiser.
     """
@@ -43,12 +48,12 @@ class JointGain:
 
     @classmethod
     def create(cls, plant: UnknownInputPlant, sensors: InputSensors) -> JointGain:
-        """From the plant and its sensors."""
+        """Return the gain of a plant and its sensors."""
         lifted = np.concatenate((plant.input_matrix, linalg.identity(plant.inputs)))
         return cls(sensors, linalg.matmul(lifted[None], sensors.inverse))
 
     def gain(self, covariance: Array, noise: Array) -> Array:
-        """𝒢 (l, s, m, N) from Φ (l, n, n, N) and R (l, m, m, N)."""
+        """Return 𝒢 (l, s, m, N) from Φ (l, n, n, N) and R (l, m, m, N)."""
         sensors = self.sensors
         u = sensors.complement
         free = u.shape[-2]
@@ -68,10 +73,7 @@ class JointGain:
         return self.onto + linalg.matmul(choice, linalg.transpose(u))
 
     def covariance(self, gain: Array, covariance: Array, noise: Array) -> Array:
-        """Covariance (l, s, s, N) of [x(k); d(k - 1)] for any gain that hides the input.
-
-        M Φ Mᵀ + 𝒢 R 𝒢ᵀ with M = [I; 0] - 𝒢 C; its blocks are Ξ_x, Ξ_d and their exact cross term.
-        """
+        """Return the covariance M Φ Mᵀ + 𝒢 R 𝒢ᵀ (l, s, s, N) of any such gain, M = [I; 0] - 𝒢 C."""
         n = covariance.shape[1]
         moved = -linalg.matmul(gain, self.sensors.matrix)
         for row in range(n):
@@ -81,14 +83,15 @@ class JointGain:
 
 @dataclass(frozen=True)
 class InputModel:
-    """What a filter believes of the input while nothing arrives: d(k) = r d(k - 1) + η(k).
+    """A filter's model of the input without a delivery: d(k) = r d(k - 1) + η(k).
 
-    So z(k + 1) = F z(k) + [ℬ η + w; η] with F = [[𝒜, r ℬ], [0, r I]]. ``memory`` r = 1 is a random
-    walk; with r < 1 the input's variance stays bounded. The actual input follows no such model.
+    It implies z(k + 1) = F z(k) + [ℬ η + w; η] with F = [[𝒜, r ℬ], [0, r I]]. ``memory`` r = 1 is a
+    random walk; with r < 1 the input's variance stays bounded. The actual input follows no such
+    model.
 
-    Shapes: ``state_rows`` [𝒜, r ℬ] (n, s, 1), ``memory`` (q, 1), ``change`` covariance of
-    [ℬ η + w; η] (s, s, 1), ``transition`` 𝒜 (n, n, 1), ``process_covariance`` 𝒲 (n, n, 1),
-    ``initial_mean`` (s, 1), ``initial_covariance`` (s, s, 1). Build one with :meth:`create`.
+    Shapes: ``state_rows`` [𝒜, r ℬ] (n, s, 1), ``memory`` (q, 1), ``change`` covariance of [ℬ η + w;
+    η] (s, s, 1), ``transition`` 𝒜 (n, n, 1), ``process_covariance`` 𝒲 (n, n, 1), ``initial_mean``
+    (s, 1), ``initial_covariance`` (s, s, 1).
     """
 
     state_rows: Array
@@ -107,13 +110,17 @@ class InputModel:
         change: ArrayLike,
         deviation: ArrayLike,
     ) -> InputModel:
-        """``memory`` r in [0, 1]; ``change`` and ``deviation`` are standard deviations.
+        """Return the model of a plant's input.
 
-        The first is that of η, the second that of an input of which nothing is known yet; each
-        one number, or one an input.
+        Args:
+            plant: the plant.
+            memory: r in [0, 1]: one number, or one per input.
+            change: deviation of η > 0: one number, or one per input.
+            deviation: deviation > 0 of an input without a measurement: one number, or one per
+                input.
 
         Raises:
-            ConfigurationError: a memory outside [0, 1], or a deviation <= 0.
+            ConfigurationError: a number outside these limits.
         """
         n, q = plant.size, plant.inputs
         retention = validation.not_negative("input_memory", memory, (q,))
@@ -144,14 +151,14 @@ class InputModel:
         return self.transition.shape[0]
 
     def predict(self, mean: Array) -> Array:
-        """F ẑ (..., s, N) from (..., s, N)."""
+        """Return F ẑ (..., s, N) from (..., s, N)."""
         n = self.size
         return np.concatenate(
             (linalg.matvec(self.state_rows, mean), self.memory * mean[..., n:, :]), axis=-2
         )
 
     def predict_covariance(self, covariance: Array) -> Array:
-        """F P Fᵀ plus the covariance of [ℬ η + w; η], (..., s, s, N) to the same."""
+        """Return F P Fᵀ plus the covariance of [ℬ η + w; η], (..., s, s, N)."""
         n = self.size
         result = np.empty(covariance.shape)
         rows = linalg.matmul(self.state_rows, covariance)
@@ -169,7 +176,7 @@ class InputModel:
         return result
 
     def without_input(self, covariance: Array) -> Array:
-        """Φ = 𝒜 Ξ_x 𝒜ᵀ + 𝒲 (..., n, n, N) from the joint covariance (..., s, s, N)."""
+        """Return Φ = 𝒜 Ξ_x 𝒜ᵀ + 𝒲 (..., n, n, N) from the joint covariance (..., s, s, N)."""
         n = self.size
         return (
             linalg.congruence(self.transition, covariance[..., :n, :n, :]) + self.process_covariance

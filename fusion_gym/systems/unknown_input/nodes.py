@@ -1,7 +1,9 @@
 """The nodes of an unknown-input system with their fusion centre, behind one interface.
 
-:class:`TableNodes` looks up what does not depend on the run; :class:`RunNodes` carries a
-covariance for every node and run. Nothing is ever fed back to a node.
+:class:`TableNodes` reads tables that all runs share; :class:`RunNodes` has a covariance for every
+node and run. Nodes get no feedback.
+
+Source: unknown_input, equations (8), (24), (25).
 
 Source: unknown_input, equations (8), (24), (25).
 """
@@ -28,7 +30,7 @@ class Estimates(NamedTuple):
     """Posteriors of [x(k); d(k - 1)], s = n + q entries.
 
     ``mean`` (l, s, N) of the nodes and ``fused_mean`` (s, N) of the centre; ``covariance``
-    (l, s, s, N), ``fused_covariance`` (s, s, N) and ``weights`` (l, N) where each run has its own.
+    (l, s, s, N), ``fused_covariance`` (s, s, N) and ``weights`` (l, N) if each run has its own.
     """
 
     mean: Array
@@ -42,7 +44,7 @@ class NodePrediction(NamedTuple):
     """Predictions for the coming measurement.
 
     ``mean`` (l, s, N), ``fused_mean`` (s, N), ``expected`` measurements (l, m, N), and
-    ``covariance`` (l, s, s, N) where each run has its own.
+    ``covariance`` (l, s, s, N) if each run has its own.
     """
 
     mean: Array
@@ -53,18 +55,18 @@ class NodePrediction(NamedTuple):
 
 @dataclass(frozen=True)
 class Nodes(ABC):
-    """Nodes and centre, with what the nodes believe of plant and input."""
+    """Nodes and centre, with the nodes' model of plant and input."""
 
     model: InputModel
     sensors: InputSensors
 
     @abstractmethod
     def start(self, runs: int) -> Estimates:
-        """Before any measurement."""
+        """Return the estimates before any measurement."""
 
     @abstractmethod
     def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
-        """Predictions for the measurements at ``time`` (N,)."""
+        """Return the predictions for the measurements at ``time`` (N,)."""
 
     @abstractmethod
     def update(
@@ -75,47 +77,43 @@ class Nodes(ABC):
         granted: NDArray[np.bool_],
         time: Array,
     ) -> Estimates:
-        """Posteriors; ``held`` (l, m, N) are the last delivered measurements, the new included."""
+        """Return the posteriors; ``held`` (l, m, N) are the last deliveries with the new ones."""
 
     @abstractmethod
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
-        """The nodes' covariances (l, s, s, N or 1) before the update at ``time``."""
+        """Return the nodes' covariances (l, s, s, N or 1) before the update at ``time``."""
 
     @abstractmethod
     def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
-        """The centre's covariance (s, s, N or 1) of the posterior at ``time``."""
+        """Return the centre's covariance (s, s, N or 1) of the posterior at ``time``."""
 
     @abstractmethod
     def variances(
         self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
-        """Weighted fused trace (N,) if nobody transmits, and its reductions (l, N) by each alone.
-
-        ``weights`` (s,) weigh the entries of the trace.
-        """
+        """Return a silent step's fused trace (N,), weighted by (s,), and its reductions (l, N)."""
 
     def _start(self, runs: int) -> tuple[Array, Array, Array]:
-        """Means (l, s, N) and (s, N) and a covariance (s, s, N), all the initial ones."""
+        """Return the initial means (l, s, N), (s, N) and covariance (s, s, N)."""
         first, initial = self.model.initial_mean, self.model.initial_covariance
         fused = np.broadcast_to(first, (len(first), runs)).copy()
         mean = np.broadcast_to(fused, (self.sensors.count, *fused.shape)).copy()
         return mean, fused, np.broadcast_to(initial, (*fused.shape[:1] * 2, runs)).copy()
 
     def _predict(self, estimates: Estimates, covariance: Array | None) -> NodePrediction:
-        """Predictions with these covariances (l, s, s, N) of the nodes."""
+        """Return predictions with these covariances (l, s, s, N) of the nodes."""
         prior = self.model.predict(np.concatenate((estimates.mean, estimates.fused_mean[None])))
         return NodePrediction(prior[:-1], prior[-1], self.sensors.expect(prior[:-1]), covariance)
 
 
 @dataclass(frozen=True)
 class TableNodes(Nodes):
-    """Nodes that hold the last measurement; gains, bounds and fusion come from tables over time.
+    """Nodes that hold the last measurement; gains, bounds and fusion are tables over time.
 
     ``tables`` hold the nodes' gains and bounds. ``state_gain`` (l, n, n, T + 1) and ``input_gain``
     (l, q, q, T + 1) are the fusion's, w_i P P_i⁻¹ of (24); ``fused`` (s, s, T + 1) is its bound;
-    ``delivered`` (l, s, s, T + 1) the bound when the measurement of one sensor alone is new;
-    ``prior`` (l, s, s, T + 1) what the input model makes of the bound of one time before. Build
-    one with :meth:`create`.
+    ``delivered`` (l, s, s, T + 1) the bound after a single sensor's delivery; ``prior``
+    (l, s, s, T + 1) the input model's prediction of the bound of one time before.
     """
 
     tables: BoundTables
@@ -129,7 +127,7 @@ class TableNodes(Nodes):
     def create(
         cls, model: InputModel, sensors: InputSensors, tables: BoundTables, fusion: NodeFusion
     ) -> TableNodes:
-        """Fuse the tables, with every time as a run and the best weights."""
+        """Return the nodes with fused tables, every time as a run, with the best weights."""
         n, (count, size, _, times) = fusion.states, tables.covariance.shape
         gains = np.zeros((count, size, size, times))
         fused = np.empty(0)
@@ -152,7 +150,7 @@ class TableNodes(Nodes):
         )
 
     def start(self, runs: int) -> Estimates:
-        """Before any measurement; covariances stay in the tables."""
+        """Return the estimates before any measurement; covariances stay in the tables."""
         mean, fused, _ = self._start(runs)
         return Estimates(mean, fused, None, None, None)
 
@@ -168,7 +166,7 @@ class TableNodes(Nodes):
         granted: NDArray[np.bool_],
         time: Array,
     ) -> Estimates:
-        """Every node takes the held measurement for the present one.
+        """Update every node with the held measurement as the present one.
 
         Source: unknown_input, equations (8), (24).
         """
@@ -181,17 +179,17 @@ class TableNodes(Nodes):
         return Estimates(mean, fused, None, None, None)
 
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
-        """From the table; at time 0, where nothing is predicted, without meaning."""
+        """Return the table's entry; at time 0, without a prediction, it has no meaning."""
         return self._at(self.prior, time)
 
     def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
-        """The bound (s, s, N); void if the trigger does not keep |σ|² <= ρ̄."""
+        """Return the bound (s, s, N), which holds if the trigger keeps |σ|² <= ρ̄."""
         return self._at(self.fused, time)
 
     def variances(
         self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
-        """The bound's trace, and how far it falls where one held difference is known to be zero."""
+        """Return the bound's trace, and its reduction where one held difference is zero."""
         silent = linalg.weighted_trace(self.fused, weights)
         reduction = silent - linalg.weighted_trace(self.delivered, weights)
         rows = self._rows(time)
@@ -201,7 +199,7 @@ class TableNodes(Nodes):
         return np.minimum(time, self.fused.shape[-1] - 1).astype(np.intp)
 
     def _at(self, table: Array, time: Array) -> Array:
-        """The table's entry at every run's time; one lane where all runs are at the same time."""
+        """Return the table's entry at every run's time, or one column if all times are equal."""
         rows = self._rows(time)
         first = int(rows[0])
         if (rows == first).all():
@@ -211,10 +209,10 @@ class TableNodes(Nodes):
 
 @dataclass(frozen=True)
 class RunNodes(Nodes):
-    """Nodes whose covariances depend on what arrived: each run carries its own.
+    """Nodes whose covariances depend on the deliveries: each run has its own.
 
-    A node that receives nothing predicts. With ``hold_variance`` h (l, 1, 1, 1) it instead takes
-    the last measurement for the present one with h added to its noise's variance; this needs the
+    A node without a delivery predicts. With ``hold_variance`` h (l, 1, 1, 1) it instead uses the
+    last measurement as the present one, with h added to its noise's variance; this needs the
     random-walk filter.
     """
 
@@ -223,7 +221,7 @@ class RunNodes(Nodes):
     hold_variance: Array | None = None
 
     def start(self, runs: int) -> Estimates:
-        """Before any measurement; all nodes are alike."""
+        """Return the estimates before any measurement, equal for all nodes."""
         mean, fused, covariance = self._start(runs)
         every = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape)).copy()
         return Estimates(
@@ -243,7 +241,7 @@ class RunNodes(Nodes):
         granted: NDArray[np.bool_],
         time: Array,
     ) -> Estimates:
-        """Granted nodes update, the others predict (or hold); the centre fuses all."""
+        """Update granted nodes, predict (or hold) the others, and fuse all."""
         gain, covariance = self._outcome(estimates, prediction, granted)
         correction = linalg.matvec(gain, held - prediction.expected)
         if self.hold_variance is None:
@@ -255,11 +253,11 @@ class RunNodes(Nodes):
         return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)
 
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
-        """The runs' own (l, s, s, N)."""
+        """Return the runs' own covariances (l, s, s, N)."""
         return _own(prediction.covariance)
 
     def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
-        """The centre's covariance (s, s, N)."""
+        """Return the centre's covariance (s, s, N)."""
         return _own(estimates.fused_covariance)
 
     def variances(
@@ -278,7 +276,7 @@ class RunNodes(Nodes):
     def _outcome(
         self, estimates: Estimates, prediction: NodePrediction, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Gain (l, s, m, N) and covariance (l, s, s, N) of an update."""
+        """Return gain (l, s, m, N) and covariance (l, s, s, N) of an update."""
         noise = self.sensors.covariance
         if isinstance(self.filter, ExactInputStateFilter):
             return self.filter.update(_own(estimates.covariance), noise)

@@ -1,4 +1,7 @@
-"""A linear plant with an unknown input, seen at its sampling instants.
+"""A linear plant with an unknown input, at its sampling instants.
+
+Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
+cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
 
 Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
@@ -25,14 +28,13 @@ _LONGEST_PERIOD = 1000  # small steps between two instants
 class UnknownInputPlant(Plant):
     """x(k + 1) = 𝒜 x(k) + ℬ d(k) + w(k), w ~ N(0, 𝒲), from one sampling instant to the next.
 
-    Between two instants the plant makes ``sampling_period`` a small steps
-    x' = A x + B d + ω, ω ~ N(0, W), with the input d held constant. So 𝒜 = Aᵃ, ℬ = Σ Aʲ B and
-    𝒲 = Σ Aʲ W Aʲᵀ over j = 0..a - 1, and moving by them at once with one draw is exact: no
-    filter and no sensor looks at the small steps.
+    Between two instants the plant makes ``sampling_period`` a small steps x' = A x + B d + ω, ω ~
+    N(0, W), with a constant input d. So 𝒜 = Aᵃ, ℬ = Σ Aʲ B and 𝒲 = Σ Aʲ W Aʲᵀ over j = 0..a - 1.
+    One draw per instant is exact, because no filter and no sensor uses the small steps.
 
-    Beside the shapes of :class:`~fusion_gym.systems.linear_plant.Plant`, with 𝒜 and 𝒲:
-    ``input_matrix`` ℬ (n, q, 1), and ``initial_half_width`` (n, 1): if given, x(0) is uniform
-    about the mean, where filters believe that it is normal. Build one with :meth:`create`.
+    In addition to the shapes of :class:`~fusion_gym.systems.linear_plant.Plant`, with 𝒜 and 𝒲:
+    ``input_matrix`` ℬ (n, q, 1), and ``initial_half_width`` (n, 1) of a uniform x(0) about the
+    mean, which filters assume to be normal.
 
     Source: unknown_input, equations (1), (3) and (4), lifted with a constant input.
     """
@@ -51,11 +53,20 @@ class UnknownInputPlant(Plant):
         initial_covariance: ArrayLike,
         initial_half_width: ArrayLike | None = None,
     ) -> UnknownInputPlant:
-        """Check the matrices of a small step (no batch axis) and lift them.
+        """Return the plant of the matrices of a small step, without a batch axis.
+
+        Args:
+            transition: A (n, n).
+            input_matrix: B (n, q), q <= n.
+            process_covariance: W (n, n).
+            sampling_period: a, from 1 to 1000.
+            initial_mean: (n,).
+            initial_covariance: (n, n).
+            initial_half_width: (n,), or None.
 
         Raises:
-            ConfigurationError: a wrong shape, an entry that is not finite, a sampling period
-                not from 1 to 1000, more inputs than states, or a covariance that is not one.
+            ConfigurationError: a wrong shape, an entry that is not finite, a number outside these
+                limits, or a covariance that is not positive semi-definite.
         """
         small = validation.square("transition", transition)
         n = len(small)
@@ -92,7 +103,7 @@ class UnknownInputPlant(Plant):
         return self.input_matrix.shape[1]
 
     def start(self, noise: Array) -> Array:
-        """Draw x(0), shape (n, N), from standard normals (n, N)."""
+        """Draw x(0) (n, N) from standard normals (n, N)."""
         if self.initial_half_width is None:
             return self.initial_mean + linalg.matvec(self.initial_factor, noise)
         return self.initial_mean + self.initial_half_width * (2.0 * ndtr(noise) - 1.0)
@@ -100,10 +111,13 @@ class UnknownInputPlant(Plant):
     def advance(
         self, state: Array, inputs: Array, noise: Array, departure: Array | None = None
     ) -> Array:
-        """x(k + 1) (n, N) from x(k) (n, N), d(k) (q, N) and standard normals (r, N).
+        """Return x(k + 1) (n, N).
 
-        With a ``departure`` (4, N) the plant moves by I + c (𝒜 - I) in the place of 𝒜, from one
-        instant to the next; the input acts as it did.
+        Args:
+            state: x(k) (n, N).
+            inputs: d(k) (q, N).
+            noise: standard normals (r, N).
+            departure: (4, N), or None; with it the plant moves by I + c (𝒜 - I).
         """
         moved = true_motion(departure, state, linalg.matvec(self.transition, state))
         moved += linalg.matvec(self.input_matrix, inputs)
@@ -112,25 +126,23 @@ class UnknownInputPlant(Plant):
         return moved
 
     def open_loop(self, signal: InputSignal, horizon: int) -> Array:
-        """Mean squared error (n + q,) over k = 1..horizon of a centre that takes the input for 0.
+        """Return the mean squared error (n + q,) over k = 1..horizon of predictions with input 0.
 
-        It predicts the state from the initial mean; the last q entries are the input's own mean
-        square. Closed form from the signal's first two moments.
+        The last q entries are the input's mean square. The closed form uses the signal's first two
+        moments.
         """
         return self.second_moments(signal, horizon, np.zeros(self.size)).mean(0)
 
     def magnitude(self, signal: InputSignal, horizon: int) -> Array:
-        """Root mean square (n + q,) of state and input over k = 1..horizon."""
+        """Return the root mean square (n + q,) of state and input over k = 1..horizon."""
         return np.sqrt(self.second_moments(signal, horizon, self.initial_mean[:, 0]).mean(0))
 
     def second_moments(self, signal: InputSignal, horizon: int, offset: Array) -> Array:
-        """Mean squares (horizon, n + q) of state and input at k = 1..horizon.
+        """Return mean squares (horizon, n + q) of state and input at k = 1..horizon.
 
-        The state's mean starts at ``offset`` (n,).
-
-        The error's random part has the covariance C' = 𝒜 C 𝒜ᵀ + 𝒜 X ℬᵀ + (𝒜 X ℬᵀ)ᵀ +
-        ℬ R(0) ℬᵀ + 𝒲 with X the covariance of the error and the coming input; in it
-        X(k + 1) = X(k) + 𝒜ᵏ ℬ R(k + 1).
+        The state's mean starts at ``offset`` (n,). The error's random part has the covariance C' =
+        𝒜 C 𝒜ᵀ + 𝒜 X ℬᵀ + (𝒜 X ℬᵀ)ᵀ + ℬ R(0) ℬᵀ + 𝒲 with X the covariance of the error and the
+        coming input, X(k + 1) = X(k) + 𝒜ᵏ ℬ R(k + 1).
         """
         a, b = self.transition[..., 0], self.input_matrix[..., 0]
         means, lags = signal.mean(horizon), signal.covariance(horizon + 1)

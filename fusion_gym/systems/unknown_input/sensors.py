@@ -1,4 +1,6 @@
-"""Linear sensors of the state, each with a noise covariance of its own.
+"""Linear sensors of the state, each with its own noise covariance.
+
+Source: unknown_input, equation (2).
 
 Source: unknown_input, equation (2).
 """
@@ -20,11 +22,11 @@ _RANK = 1e-8  # singular values below this share of what they could be count as 
 
 @dataclass(frozen=True)
 class InputSensors:
-    """y_i(k) = C_i x(k) + ν_i(k), ν_i ~ N(0, V_i), with an input that every sensor can see.
+    """y_i(k) = C_i x(k) + ν_i(k), ν_i ~ N(0, V_i), with an input that every sensor can observe.
 
     Shapes: ``matrix`` C (l, m, n, 1), ``covariance`` V (l, m, m, 1), ``factor`` (l, m, m, 1) with
     factor factorᵀ = V. From the plant: ``inverse`` (C ℬ)⁺ (l, q, m, 1) and ``complement`` U
-    (l, m, m - q, 1), an orthonormal basis of the kernel of (C ℬ)ᵀ. Build one with :meth:`create`.
+    (l, m, m - q, 1), an orthonormal basis of the kernel of (C ℬ)ᵀ.
 
     Source: unknown_input, equation (2).
     """
@@ -39,11 +41,16 @@ class InputSensors:
     def create(
         cls, matrices: ArrayLike, covariances: ArrayLike, plant: UnknownInputPlant
     ) -> InputSensors:
-        """Check C (l, m, n) and V: one number, one a sensor, (l, m) variances, or (l, m, m).
+        """Return sensors from arrays without a batch axis.
+
+        Args:
+            matrices: C (l, m, n).
+            covariances: V: one number, one per sensor, variances (l, m), or matrices (l, m, m).
+            plant: the plant.
 
         Raises:
-            ConfigurationError: a wrong shape, a V_i that is not positive definite, or a sensor
-                that cannot see the input: rank(C_i ℬ) below the number of inputs.
+            ConfigurationError: a wrong shape, a V_i that is not positive definite, or a sensor that
+                cannot observe the input: rank(C_i ℬ) below the number of inputs.
         """
         c = validation.array("measurement_matrices", matrices, (None, None, None))
         c = validation.array("measurement_matrices", matrices, (*c.shape[:2], plant.size))
@@ -77,18 +84,18 @@ class InputSensors:
         return self.count * self.size
 
     def measure(self, state: Array, noise: Array) -> Array:
-        """Measurements (l, m, N) of the state (n, N) with standard normals (l·m, N)."""
+        """Return measurements (l, m, N) of the state (n, N) with standard normals (l·m, N)."""
         result = linalg.matvec(self.matrix, state)
         result += linalg.matvec(self.factor, noise.reshape(self.count, self.size, -1))
         return result
 
     def expect(self, mean: Array) -> Array:
-        """C x̂ (l, m, N) from means (l, s, N) or (s, N), whose first n entries are the state's."""
+        """Return C x̂ (l, m, N) of means (l, s, N) or (s, N) that begin with the n states."""
         return linalg.matvec(self.matrix, mean[..., : self.matrix.shape[2], :])
 
 
 def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
-    """V as (l, m, m)."""
+    """Return V as (l, m, m)."""
     try:
         values = np.asarray(value)
     except ValueError:
@@ -107,7 +114,7 @@ def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
 
 
 def _seen_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> tuple[Array, Array]:
-    """(C ℬ)⁺ and the kernel of (C ℬ)ᵀ, or an error if C ℬ has deficient rank."""
+    """Return (C ℬ)⁺ and the kernel of (C ℬ)ᵀ, or refuse a C ℬ of deficient rank."""
     inputs = plant.input_matrix[..., 0]
     q, observed = plant.inputs, matrix @ inputs
     left, values, right = np.linalg.svd(observed)

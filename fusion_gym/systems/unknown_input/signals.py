@@ -1,7 +1,7 @@
-"""Signals that drive a plant as its unknown input: sinusoids, steps, a random walk, an array.
+"""Unknown inputs of a plant: sinusoids, steps, a random walk, an array.
 
-An input d(k) acts from sampling instant k to k + 1. A signal is drawn anew in every episode from
-that episode's noise, so that nobody can know it in advance.
+An input d(k) acts from sampling instant k to k + 1. Every episode draws its signal from the
+episode's noise, so that no policy knows it in advance.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class InputSignal(ABC):
     """q inputs over time, for N runs at once (batch axis last).
 
     ``start`` turns standard normals (start_channels, N) into a memory (rows, N), ``value`` reads
-    the input (q, N) at the runs' times (N,) from it, and ``advance`` moves the memory on by one
+    the input (q, N) at the runs' times (N,) from it, and ``advance`` moves the memory by one
     sampling instant with standard normals (noise_channels, N).
     """
 
@@ -44,32 +44,31 @@ class InputSignal(ABC):
 
     @abstractmethod
     def start(self, noise: Array) -> Array:
-        """Memory (rows, N) of new episodes."""
+        """Return the memory (rows, N) of new episodes."""
 
     @abstractmethod
     def value(self, memory: Array, time: Array) -> Array:
-        """The input (q, N) from the instant ``time`` (N,) to the next."""
+        """Return the input (q, N) from the instant ``time`` (N,) to the next."""
 
     def advance(self, memory: Array, noise: Array) -> Array:
-        """The memory one instant later."""
+        """Return the memory one instant later."""
         return memory
 
     def mean(self, horizon: int) -> Array:
-        """Expectation (horizon, q) of d(0), ..., d(horizon - 1) over episodes."""
+        """Return the expectation (horizon, q) of d(0), ..., d(horizon - 1) over episodes."""
         return np.zeros((horizon, self.size))
 
     def covariance(self, horizon: int) -> Array:
-        """Cov(d(k), d(k + lag)) for lag = 0..horizon - 1, (horizon, q, q), the same for all k."""
+        """Return Cov(d(k), d(k + lag)) for lag = 0..horizon - 1, (horizon, q, q), for every k."""
         return np.zeros((horizon, self.size, self.size))
 
 
 @dataclass(frozen=True)
 class Sinusoids(InputSignal):
-    """d_j(k) = Σ_i a_ji sin(2π k / p_ji + φ_ji), its phases drawn evenly or given.
+    """d_j(k) = Σ_i a_ji sin(2π k / p_ji + φ_ji), with random or fixed phases.
 
     ``amplitude`` a, in the input's unit, and ``period`` p, in sampling instants, are (q, terms, 1);
-    ``phase`` φ, in radians, is (q, terms, 1) or ``None``: drawn for each episode. Build one with
-    :meth:`create`.
+    ``phase`` φ, in radians, is (q, terms, 1), or ``None`` for a draw in each episode.
     """
 
     amplitude: Array
@@ -80,11 +79,16 @@ class Sinusoids(InputSignal):
     def create(
         cls, size: int, amplitude: ArrayLike, period: ArrayLike, phase: ArrayLike | str = "random"
     ) -> Sinusoids:
-        """Check the numbers: one for all, (terms,) for all inputs, or (size, terms).
+        """Return the signal of numbers for all, (terms,) for all inputs, or (size, terms).
+
+        Args:
+            size: number of inputs q.
+            amplitude: a, in the input's unit.
+            period: p > 0, in sampling instants.
+            phase: φ in radians, or "random".
 
         Raises:
-            ConfigurationError: a wrong shape, a period <= 0, or a phase that is text other than
-                "random".
+            ConfigurationError: a wrong shape, a period <= 0, or another text.
         """
         random = isinstance(phase, str)
         if random and phase != "random":
@@ -103,17 +107,17 @@ class Sinusoids(InputSignal):
 
     @property
     def start_channels(self) -> int:
-        """One for each phase that is drawn."""
+        """One for each random phase."""
         return self.amplitude.size if self.phase is None else 0
 
     def start(self, noise: Array) -> Array:
-        """The phases (q·terms, N), in radians."""
+        """Return the phases (q·terms, N), in radians."""
         if self.phase is None:
             return 2.0 * np.pi * ndtr(noise)
         return np.broadcast_to(self.phase.reshape(-1, 1), (self.phase.size, noise.shape[-1])).copy()
 
     def value(self, memory: Array, time: Array) -> Array:
-        """The input (q, N) at the runs' times (N,)."""
+        """Return the input (q, N) at the runs' times (N,)."""
         angle = memory.reshape(*self.amplitude.shape[:2], -1) + (2.0 * np.pi / self.period) * time
         terms = self.amplitude * np.sin(angle)
         total: Array = terms[:, 0].copy()
@@ -122,14 +126,14 @@ class Sinusoids(InputSignal):
         return total
 
     def mean(self, horizon: int) -> Array:
-        """(horizon, q): zero if phases are drawn, else the signal itself."""
+        """Return zero (horizon, q) for random phases, else the signal itself."""
         if self.phase is None:
             return super().mean(horizon)
         memory = np.broadcast_to(self.phase.reshape(-1, 1), (self.phase.size, horizon))
         return self.value(memory, np.arange(horizon, dtype=np.float64)).T
 
     def covariance(self, horizon: int) -> Array:
-        """(horizon, q, q): Σ a²/2 cos(2π lag / p) for phases that are drawn, else zero."""
+        """Return Σ a²/2 cos(2π lag / p) (horizon, q, q) for random phases, else zero."""
         result = super().covariance(horizon)
         if self.phase is None:
             angle = 2.0 * np.pi / self.period * np.arange(horizon)
@@ -139,7 +143,7 @@ class Sinusoids(InputSignal):
 
 
 def _terms(*values: ArrayLike) -> int:
-    """Number of sinusoids: the longest last axis; wrong shapes are told later, field by field."""
+    """Return the number of sinusoids, the longest last axis."""
     lengths = []
     for value in values:
         try:
@@ -152,9 +156,9 @@ def _terms(*values: ArrayLike) -> int:
 
 @dataclass(frozen=True)
 class _Stationary(InputSignal):
-    """What signals share whose memory is their value, drawn from a stationary distribution.
+    """The common part of signals whose memory is their value, with a stationary distribution.
 
-    ``amplitude`` (q, 1) is its standard deviation in the input's unit, its mean is zero; ``period``
+    ``amplitude`` (q, 1) is the standard deviation in the input's unit, the mean is zero; ``period``
     (q, 1) is in sampling instants, at least 1.
     """
 
@@ -163,10 +167,15 @@ class _Stationary(InputSignal):
 
     @classmethod
     def create(cls, size: int, amplitude: ArrayLike, period: ArrayLike) -> Self:
-        """Check the numbers: one for all inputs, or (size,).
+        """Return the signal of one number for all inputs, or (size,).
+
+        Args:
+            size: number of inputs q.
+            amplitude: standard deviation > 0, in the input's unit.
+            period: >= 1, in sampling instants.
 
         Raises:
-            ConfigurationError: a wrong shape, an amplitude <= 0 or a period < 1.
+            ConfigurationError: a wrong shape, or a number outside these limits.
         """
         return cls(*_scale_and_period(size, amplitude, period))
 
@@ -177,56 +186,56 @@ class _Stationary(InputSignal):
 
     @property
     def start_channels(self) -> int:
-        """The first values."""
+        """One for each first value."""
         return self.size
 
     def start(self, noise: Array) -> Array:
-        """Values (q, N) drawn from the stationary distribution."""
+        """Draw values (q, N) from the stationary distribution."""
         return self.amplitude * noise
 
     def value(self, memory: Array, time: Array) -> Array:
-        """The values (q, N)."""
+        """Return the values (q, N)."""
         return memory
 
 
 @dataclass(frozen=True)
 class Steps(_Stationary):
-    """Each input keeps its level and jumps to a new one with the probability 1/``period``."""
+    """Levels that jump to a new one with the probability 1/``period``."""
 
     @property
     def noise_channels(self) -> int:
-        """Whether to jump, and where to."""
+        """Two for each input: the jump and the new level."""
         return 2 * self.size
 
     def advance(self, memory: Array, noise: Array) -> Array:
-        """The levels (q, N) one instant later."""
+        """Return the levels (q, N) one instant later."""
         jump = ndtr(noise[: self.size]) * self.period < 1.0
         return np.where(jump, self.amplitude * noise[self.size :], memory)
 
     def covariance(self, horizon: int) -> Array:
-        """(horizon, q, q): a² (1 - 1/period)^lag on the diagonal."""
+        """Return (horizon, q, q): a² (1 - 1/period)^lag on the diagonal."""
         return _geometric(self.amplitude, 1.0 - 1.0 / self.period, horizon)
 
 
 @dataclass(frozen=True)
 class MeanRevertingWalk(_Stationary):
-    """d(k + 1) = r d(k) + a √(1 - r²) η with r = exp(-1/period): a random walk held back.
+    """d(k + 1) = r d(k) + a √(1 - r²) η with r = exp(-1/period).
 
     Its variance stays at a², ``period`` is the correlation time.
     """
 
     @property
     def noise_channels(self) -> int:
-        """The steps of the walk."""
+        """One for each input."""
         return self.size
 
     def advance(self, memory: Array, noise: Array) -> Array:
-        """The values (q, N) one instant later."""
+        """Return the values (q, N) one instant later."""
         retention = np.exp(-1.0 / self.period)
         return retention * memory + self.amplitude * np.sqrt(1.0 - retention * retention) * noise
 
     def covariance(self, horizon: int) -> Array:
-        """(horizon, q, q): a² exp(-lag/period) on the diagonal."""
+        """Return (horizon, q, q): a² exp(-lag/period) on the diagonal."""
         return _geometric(self.amplitude, np.exp(-1.0 / self.period), horizon)
 
 
@@ -249,16 +258,21 @@ def _geometric(amplitude: Array, ratio: Array, horizon: int) -> Array:
 
 @dataclass(frozen=True)
 class ArrayInput(InputSignal):
-    """The same inputs in every episode: ``values`` (rows, q, 1), one row a sampling instant.
+    """The same inputs in every episode: ``values`` (rows, q, 1), one row per sampling instant.
 
-    After the last row the input stays where it is.
+    After the last row the input is constant.
     """
 
     values: Array
 
     @classmethod
     def create(cls, size: int, values: ArrayLike, horizon: int) -> ArrayInput:
-        """Check an array (horizon + 1, size): d(0), ..., d(horizon).
+        """Return the signal of an array.
+
+        Args:
+            size: number of inputs q.
+            values: d(0), ..., d(horizon), (horizon + 1, size).
+            horizon: steps of an episode.
 
         Raises:
             ConfigurationError: another shape, or an entry that is not finite.
@@ -271,14 +285,14 @@ class ArrayInput(InputSignal):
         return self.values.shape[1]
 
     def start(self, noise: Array) -> Array:
-        """Nothing to remember: (0, N)."""
+        """Return an empty memory (0, N)."""
         return np.empty((0, noise.shape[-1]))
 
     def value(self, memory: Array, time: Array) -> Array:
-        """The rows (q, N) of the runs' times (N,)."""
+        """Return the rows (q, N) of the runs' times (N,)."""
         rows = np.minimum(time.astype(np.intp), len(self.values) - 1)
         return np.ascontiguousarray(self.values[rows, :, 0].T)
 
     def mean(self, horizon: int) -> Array:
-        """The rows themselves, (horizon, q)."""
+        """Return the rows (horizon, q)."""
         return self.values[np.minimum(np.arange(horizon), len(self.values) - 1), :, 0]

@@ -2,6 +2,9 @@
 
 Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
+
+Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
+cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
 """
 
 import functools
@@ -37,13 +40,13 @@ _IMAGINED = 32  # signals of which one is taken, where one is imagined
 
 @dataclass(slots=True)
 class UnknownInputState:
-    """Everything about N runs at one time; n states, q inputs, s = n + q, l sensors, m components.
+    """The state of N runs at one time; n states, q inputs, s = n + q, l sensors, m components.
 
     ``truth`` (s, N), the state x(k) and the input d(k - 1) that has just acted · ``signal``
     (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since the start ·
     ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
     instants since then · ``estimates``, the posteriors · ``prediction``, the predictions ·
-    ``departure`` (4, N) of the truth from the model, if it departs.
+    ``departure`` (4, N) of the truth from the model, if any.
     """
 
     truth: Array
@@ -67,11 +70,11 @@ SIGNALS = common_signals(
 
 @dataclass(frozen=True)
 class UnknownInputSystem(System[UnknownInputState]):
-    """Joins a plant, its input signal, and nodes with a fusion centre.
+    """A plant, its input signal, and nodes with a fusion centre.
 
-    What is estimated is [x(k); d(k - 1)]: the input is seen only once it has acted. One step is
-    one sampling instant. ``state_weights`` (s,) weigh the traces among the signals, ``magnitude``
-    (s,) divides observed estimates, and ``reference`` (s,) observed variances.
+    The estimated quantity is [x(k); d(k - 1)]: an input becomes observable only after it has acted.
+    One step is one sampling instant. ``state_weights`` (s,) weigh the traces among the signals,
+    ``magnitude`` (s,) divides observed estimates, and ``reference`` (s,) observed variances.
     """
 
     plant: UnknownInputPlant
@@ -91,24 +94,23 @@ class UnknownInputSystem(System[UnknownInputState]):
 
     @property
     def noise_channels(self) -> int:
-        """Normals of one step: the input's, the process noise, the sensors' noises."""
+        """Normals of one step: input, process noise, sensors."""
         own = self.plant.noise_channels + self.nodes.sensors.noise_channels
         return self.signal.noise_channels + own
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: the initial state, the first measurements' noise, the signal,
-        nature's."""
+        """Normals of a start: initial state, first measurements, signal, nature's."""
         own = self.plant.size + self.nodes.sensors.noise_channels
         return own + self.signal.start_channels + self.nature.channels
 
     def offers(self, capability: str) -> bool:
         """See :class:`System`.
 
-        Covariances follow from the deliveries where nodes predict while nothing arrives: not with
-        the paper's filter, nor with a hold variance, which do not show how old the held measurement
-        is. They are claims under the filter's model of the input, not the actual ones. A signal
-        that is not drawn cannot be imagined.
+        Covariances follow from the deliveries if nodes predict without a delivery: not with the
+        paper's filter, nor with a hold variance, whose covariance ignores the age of the held
+        measurement. They refer to the filter's model of the input. A fixed signal cannot be
+        imagined.
         """
         if capability == "covariance_cycle":
             return isinstance(self.nodes, RunNodes) and self.nodes.hold_variance is None
@@ -118,7 +120,7 @@ class UnknownInputSystem(System[UnknownInputState]):
 
     @property
     def covariance_cycle(self) -> int:
-        """1: the recursion never changes."""
+        """1: the recursion of the covariances does not depend on time."""
         return 1
 
     @property
@@ -162,7 +164,7 @@ class UnknownInputSystem(System[UnknownInputState]):
         )
 
     def start(self, noise: Array) -> UnknownInputState:
-        """Time 0: the state is drawn and every first measurement is known, free of charge."""
+        """Draw the initial state; every first measurement is known without charge."""
         n, sensors = self.plant.size, self.nodes.sensors
         runs, count = noise.shape[-1], sensors.noise_channels
         noise, departure = self.nature.begin(noise)
@@ -182,7 +184,7 @@ class UnknownInputSystem(System[UnknownInputState]):
         )
 
     def sense(self, state: UnknownInputState, noise: Array) -> UnknownInputState:
-        """The input acts for one sampling interval, the sensors measure, the nodes predict.
+        """Move the plant under the input for one interval, measure, and predict at the nodes.
 
         Source: unknown_input, equations (2) and (4).
         """
@@ -203,7 +205,7 @@ class UnknownInputSystem(System[UnknownInputState]):
         )
 
     def deliver(self, state: UnknownInputState, granted: NDArray[np.bool_]) -> UnknownInputState:
-        """The nodes make of what was granted (sensors, N) what they can, the centre fuses.
+        """Update the nodes with the granted (sensors, N) measurements, and fuse.
 
         Source: unknown_input, equations (8), (24), (25).
         """
@@ -219,7 +221,7 @@ class UnknownInputSystem(System[UnknownInputState]):
     def read(
         self, state: UnknownInputState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals named in ``SIGNALS``."""
+        """Return the signals of ``SIGNALS``."""
         prediction = sensed(state.prediction)
 
         @functools.cache
@@ -243,7 +245,7 @@ class UnknownInputSystem(System[UnknownInputState]):
         }
 
     def visible(self, state: UnknownInputState) -> UnknownInputState:
-        """The state without the truth, the input to come and the departure."""
+        """Return the state without the truth, the coming input and the departure."""
         return replace(
             state,
             truth=np.full_like(state.truth, np.nan),
@@ -253,18 +255,18 @@ class UnknownInputSystem(System[UnknownInputState]):
 
     @property
     def imagination_channels(self) -> int:
-        """For the states and for ``_IMAGINED`` signals."""
+        """Number of states, and the normals of ``_IMAGINED`` signals."""
         signal = self.signal.noise_channels + _IMAGINED * (self.signal.start_channels + 1)
         return self.plant.size + signal
 
     def imagine(
         self, state: UnknownInputState, mean: Array, covariance: Array, noise: Array
     ) -> UnknownInputState:
-        """The signal is drawn by its law and by what is believed of the input that has just acted.
+        """Draw the signal from its law and the belief about the input that has just acted.
 
-        Of ``_IMAGINED`` signals drawn as at a start, one is taken with the probability that its
-        last value has under N(mean, covariance); the rest of the truth follows that distribution,
-        given this value. What older estimates tell of the signal's course is not used.
+        Of ``_IMAGINED`` signals drawn as at a start, one is chosen in proportion to the density of
+        its last value under N(mean, covariance). The rest of the truth follows that distribution,
+        given this value. The draw ignores older estimates of the signal.
         """
         n, steps, runs = self.plant.size, self.signal.noise_channels, len(state.time)
         first, moving, drawn = np.split(noise, (n, n + steps))
@@ -291,16 +293,16 @@ class UnknownInputSystem(System[UnknownInputState]):
         )
 
     def fused(self, state: UnknownInputState) -> tuple[Array, Array]:
-        """The centre's mean (n + q, N) and covariance (n + q, n + q, N) of both."""
+        """Return the centre's mean (n + q, N) and covariance (n + q, n + q, N)."""
         covariance = self.nodes.fused_covariance(state.estimates, state.time)
         return state.estimates.fused_mean, _lanes(covariance, len(state.time))
 
     def local_means(self, state: UnknownInputState) -> Array:
-        """The nodes' posterior means (sensors, n + q, N); nothing is fed back to them."""
+        """Return the nodes' posterior means (sensors, n + q, N)."""
         return state.estimates.mean
 
     def open_loop(self, horizon: int) -> Array:
-        """Mean squared error (n + q,) over k = 1..horizon of a centre that takes d for zero."""
+        """Return the mean squared error (n + q,) over k = 1..horizon of a prediction with d = 0."""
         return self.plant.open_loop(self.signal, horizon)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
@@ -311,7 +313,7 @@ class UnknownInputSystem(System[UnknownInputState]):
         return largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation), 0.0
 
     def _deviation(self, state: UnknownInputState) -> Array:
-        """The innovation's deviation (l, m, N or 1)."""
+        """Return the innovation's deviation (l, m, N or 1)."""
         n, sensors = self.plant.size, self.nodes.sensors
         prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
         spread = linalg.matmul(sensors.matrix, prior[:, :n, :n])
@@ -344,5 +346,5 @@ class UnknownInputSystem(System[UnknownInputState]):
 
 
 def _lanes(value: Array, runs: int) -> Array:
-    """One lane for all, or a lane each, to (..., runs)."""
+    """Broadcast one column for all runs, or one for each, to (..., runs)."""
     return np.broadcast_to(value, (*value.shape[:-1], runs))
