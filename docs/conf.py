@@ -43,6 +43,7 @@ nb_execution_in_temp = True
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # warnings name paths
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 # A heading may begin below the first level, as in an environment's sections.

@@ -151,7 +151,7 @@ def sentences(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> list[str]
     def places(sign: int) -> str:
         """Return the classes where agents differ by more than the gain, with a whole interval."""
         count = [
-            f"{row.setting} ({TITLES[row.name]})"
+            f"{row.setting.replace('_', ' ')} ({TITLES[row.name]})"
             for row in rows
             if row.kind == "agent"
             and sign * row.difference >= GAIN
