@@ -132,7 +132,8 @@ $(VENV)/.docs: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,docs]'
 	touch $@
 
-docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, its links checked
+docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links and length of its prose checked
+	$(BIN)/python tests/prose.py
 	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -c docs -d runs/docs/doctrees . site/html
 	echo '<meta http-equiv="refresh" content="0; url=html/docs/index.html">' > site/index.html
 

@@ -1,4 +1,4 @@
-"""Results on disk, each under a hash of its inputs and of the code that computes it."""
+"""Results on disk, each under a hash of its inputs and its code."""
 
 import ast
 import contextlib
@@ -27,8 +27,8 @@ class Cache:
     """Results of functions in a folder, by :class:`joblib.Memory`.
 
     A result's key is the function's qualified name, its plain inputs, and the code of its module
-    with all that the module imports. An entry that cannot be read counts as absent. Several
-    processes may use a folder at once; a killed process leaves no entry that can be read.
+    and its imports. An unreadable entry counts as absent. Several processes may use a folder at
+    once; a killed process leaves no readable entry.
 
     Args:
         folder: Where the results are; only results of a trusted origin, for they are pickles.
@@ -37,7 +37,7 @@ class Cache:
     folder: Path
 
     def holds(self, function: Function, inputs: Inputs) -> bool:
-        """Return whether the result is there and can be read."""
+        """Return whether the result exists and is readable."""
         try:
             self.read(function, inputs)
         except FileNotFoundError:
@@ -45,13 +45,13 @@ class Cache:
         return True
 
     def call(self, function: Function, inputs: Inputs, *arguments: Any, **keywords: Any) -> Any:
-        """Return ``function(*arguments, **keywords)``, from the folder where it is there.
+        """Return the stored result, or compute and store ``function(*arguments, **keywords)``.
 
         Args:
             function: A function of a module.
-            inputs: All that the result depends on beside the code, as plain data.
-            arguments: The function's arguments.
-            keywords: The function's keywords.
+            inputs: All inputs of the result except the code, as plain data.
+            *arguments: The function's arguments.
+            **keywords: The function's keywords.
 
         Raises:
             ConfigurationError: the result cannot be written.
@@ -71,11 +71,7 @@ class Cache:
                 ) from None
 
     def read(self, function: Function, inputs: Inputs) -> Any:
-        """Return the result that is there.
-
-        Raises:
-            FileNotFoundError: there is none that can be read.
-        """
+        """Return an existing result."""
         entry = self._entry(function, inputs)
         try:
             return entry.get()
@@ -84,7 +80,7 @@ class Cache:
             return _refuse()
 
     def drop(self, function: Function, inputs: Inputs) -> None:
-        """Remove the result, if it is there."""
+        """Remove the result, if it exists."""
         with contextlib.suppress(FileNotFoundError):
             self._entry(function, inputs).clear()
 
@@ -112,7 +108,7 @@ def _key(function: Function, inputs: Inputs) -> str:
 
 @functools.cache
 def code_of(module: str) -> str:
-    """Return a hash of the code of a module and of all modules of the project that it imports.
+    """Return a hash of the code of a module and of the project's modules that it imports.
 
     Comments and docstrings do not count.
     """
@@ -136,7 +132,7 @@ def _source(name: str) -> Path | None:
 
 @functools.cache
 def read_module(name: str, path: Path) -> tuple[str, list[str]]:
-    """Return a hash of a module's code, and the names of what it may import."""
+    """Return a hash of a module's code, and the names of its possible imports."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(body := getattr(node, "body", None), list):

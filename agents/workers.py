@@ -1,7 +1,7 @@
-"""Who does the work, and where its files are: processes of this machine, or a cluster.
+"""Workers of jobs: processes of this machine, or a cluster.
 
-joblib hands it out, through its own processes (``loky``) or a dask scheduler. On other machines
-every path must be the same: the folders of results and work are shared.
+joblib distributes them to its own processes (``loky``) or a dask scheduler. On other machines every
+path must be the same: all machines share the folders of results and work.
 """
 
 from __future__ import annotations
@@ -30,12 +30,9 @@ _PATIENCE = 30.0  # seconds until a scheduler that does not answer is given up
 
 @dataclass(frozen=True)
 class Pool:
-    """``workers`` processes here, or all of the cluster at ``address``.
+    """``workers`` processes of this machine, or a cluster at ``address``.
 
-    With ``dask`` and without an address a cluster of so many workers is begun here.
-
-    Raises:
-        ConfigurationError: an address where there is no cluster.
+    ``dask`` without an address starts a cluster of so many workers on this machine.
     """
 
     workers: int = 2
@@ -51,21 +48,17 @@ class Pool:
 
     @property
     def local(self) -> bool:
-        """Whether the workers are processes of this one."""
+        """Whether the workers are child processes."""
         return self.backend == "loky"
 
     def map_unordered(self, function: Callable[[Any], Any], pieces: Sequence[Any]) -> Iterator[Any]:
-        """Let the pool do the pieces; what the function returns, as it comes. While connected."""
+        """Yield the results of the pieces in the order of their completion, while connected."""
         calls = (joblib.delayed(function)(piece) for piece in pieces)
         yield from joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
 
     @contextlib.contextmanager
     def connect(self) -> Iterator[None]:
-        """Hand work to the pool while this is entered.
-
-        Raises:
-            ConfigurationError: dask is not installed, or nobody is at the address.
-        """
+        """Connect to the pool for the duration of the context."""
         with contextlib.ExitStack() as stack:
             if not self.local:
                 try:
@@ -94,7 +87,7 @@ class Pool:
 
 
 class Call(NamedTuple):
-    """A call, and about how long it takes in seconds on one core."""
+    """A call, with its approximate seconds on one core."""
 
     weight: float
     function: Callable[..., Any]
@@ -102,7 +95,7 @@ class Call(NamedTuple):
 
 
 class WorkPiece(Protocol):
-    """A piece of work: all that its result depends on, and its time in seconds on one core."""
+    """A piece of work: all inputs of its result, and its seconds on one core."""
 
     @property
     def inputs(self) -> dict[str, Any]: ...
@@ -113,7 +106,7 @@ class WorkPiece(Protocol):
 def missing(
     function: Callable[[Any], Any], pieces: Iterable[WorkPiece], cache: Cache
 ) -> list[Call]:
-    """Return the calls that put the results of these pieces into the cache, each once."""
+    """Return the calls that compute the missing results of these pieces, each once."""
     every = {fingerprint(piece.inputs): piece for piece in pieces}
     return [
         Call(piece.weight, _fill, (cache, function, piece))
@@ -127,12 +120,7 @@ def _fill(cache: Cache, function: Callable[[Any], Any], piece: WorkPiece) -> Non
 
 
 def side_by_side(work: Sequence[Call], pool: Pool, description: str) -> list[Any]:
-    """Let the pool do the work, show how far it is, and return the results in the work's order.
-
-    Raises:
-        ConfigurationError: some of it does not fit, there is no such pool, or the system ended a
-            worker.
-    """
+    """Run the work in the pool with progress, and return the results in the work's order."""
     if not work:
         return []
     results: list[Any] = [None] * len(work)
@@ -155,7 +143,7 @@ def side_by_side(work: Sequence[Call], pool: Pool, description: str) -> list[Any
 
 
 def _do(parent: int | None, item: tuple[int, Call]) -> tuple[int, Any]:
-    """Return the place and the result of a call. A worker here ends with its ``parent``."""
+    """Return place and result of a call; a local worker ends with its ``parent``."""
     if parent is not None and os.getpid() != parent:
         end_with(parent)
     place, call = item
@@ -168,9 +156,9 @@ _EVERY = 1.0  # seconds between two looks
 
 @functools.cache
 def end_with(parent: int) -> None:
-    """End this process soon after its ``parent`` is gone, also where that was killed.
+    """End this process soon after its ``parent``, also after a kill.
 
-    The system then gives an orphan another parent. Where it does not (Windows), nothing happens.
+    The system then gives an orphan another parent. On Windows, where it does not, nothing happens.
     """
 
     def watch() -> None:

@@ -2,8 +2,8 @@
 
     python -m benchmarks.newcomer [--resume]
 
-Each YAML block of the page is a plant, whose name is the folder of its comparison, too. A command
-that has ended is not run again with ``--resume``, and a training that was cut off goes on.
+Each YAML block of the page is a plant, whose name is also the folder of its comparison.
+``--resume`` skips finished commands and continues an interrupted training.
 """
 
 import argparse
@@ -35,7 +35,7 @@ class Run:
 
 
 def main() -> None:
-    """Run what is missing, then write tables and figures."""
+    """Run missing commands, then write tables and figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--resume", action="store_true", help="keep the commands that have ended")
     parser.add_argument("--folder", type=Path, default=Path("runs/newcomer"))
@@ -59,11 +59,7 @@ def main() -> None:
 
 
 def run(line: str, folder: Path) -> Run:
-    """Run a command in the folder, or read what an earlier run took.
-
-    Raises:
-        RuntimeError: it failed; the message ends with what it said.
-    """
+    """Run a command in the folder, or read the time of an earlier run."""
     words = shlex.split(line)
     stored = folder / f"{'_'.join(re.findall(r'[a-z]+', line))[:120]}.json"
     if not stored.exists():
@@ -83,7 +79,7 @@ def run(line: str, folder: Path) -> Run:
 
 
 def points_table(path: Path) -> str:
-    """The agent beside the best rule at each price."""
+    """Return the table of the agent and the best rule at each price."""
     rows = []
     for point in json.loads(path.read_text())["points"]:
         comparison: dict[str, Any] = point["at_price"]
@@ -97,7 +93,7 @@ def points_table(path: Path) -> str:
 
 
 def seconds_table(runs: list[Run]) -> str:
-    """Seconds of each command, of the wall and of the processor."""
+    """Return the table of each command's wall and processor seconds."""
     rows = [(f"`{item.command}`", f"{item.seconds:.0f}", f"{item.processor:.0f}") for item in runs]
     return table(("command", "seconds", "of the processor"), rows)
 

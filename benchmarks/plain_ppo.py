@@ -3,13 +3,13 @@
     python -m benchmarks.plain_ppo [SETTING …] [--output runs/plain_ppo] [--resume]
 
 The settings are the registered environments with their defaults, and the Tobit oscillator of
-``configs/benchmark.yaml``. Nothing is tuned to any of them. Rewards are
-normalised, and their error is the mismatch. Rules and agents have no memory and
-run the same episodes. An agent's share is 0 at the return of the best simple rule, which looks at
-nothing but the clock or a coin, and 1 at that of the best rule of the environment's sweep. A
-training and the rules of a setting are pieces, stored one by one: ``--resume`` keeps them.
+``configs/benchmark.yaml``. No parameter is tuned to a setting. Rewards are normalised, and their
+error is the mismatch. Rules and agents have no memory and run the same episodes. An agent's share
+is 0 at the return of the best simple rule, which uses only the clock or random numbers, and 1 at
+the return of the best rule of the environment's sweep. A training and the rules of a setting are
+pieces with a file each: ``--resume`` skips finished ones.
 
-In the biased oscillator the error runs away in about one episode of a thousand: a share there has a
+In the biased oscillator the error diverges in about one episode of a thousand: a share there has a
 standard error of about .3, and of .75 with 300 episodes.
 """
 
@@ -86,8 +86,7 @@ SETTINGS = {
 class Row:
     """A setting: processor seconds, the best rules' returns, and the shares of each training.
 
-    The first share is that of an agent that takes its likeliest actions, the second of one that
-    draws them.
+    The first share is of an agent with its likeliest actions, the second with random draws.
     """
 
     setting: str
@@ -125,7 +124,7 @@ def main() -> None:
 
 
 def judge(name: str, arguments: argparse.Namespace) -> Row:
-    """Return the row of a setting, of the pieces that are stored or run now."""
+    """Return the row of a setting, from stored pieces or a run."""
     setting, folder = SETTINGS[name], arguments.output / name
     asked = {"episodes": arguments.episodes}
     run = partial(run_rules, setting, **asked)
@@ -147,7 +146,7 @@ def judge(name: str, arguments: argparse.Namespace) -> Row:
 def piece(
     path: Path, resume: bool, run: Callable[[], Returns], asked: dict[str, Any]
 ) -> tuple[Returns, float]:
-    """Return what ``run`` returns, or what is stored of it, and the processor seconds it took."""
+    """Return the result of ``run``, or a stored one, and its processor seconds."""
     stored = json.loads(path.read_text()) if resume and path.exists() else {}
     if stored.get("asked") != asked:
         before = time.process_time()
@@ -168,7 +167,7 @@ def train(
     setting: Setting, shown: dict[str, Any], seed: int, *, episodes: int, timesteps: int,
     gamma: float, n_steps: int,
 ) -> Returns:  # fmt: skip
-    """Return the mean return of a training's agent, for each way to choose its actions."""
+    """Return the mean return of a training's agent, for likeliest and drawn actions."""
     options = setting.options | shown
     env = make_sb3_vec_env(
         setting.environment, num_envs=64, seed=seed, training_error="mismatch", **options
@@ -183,7 +182,7 @@ def train(
 
 
 def mean_return(task: Task, policy: Policy, episodes: int) -> float:
-    """Return the mean over the episodes with the seeds from 0 on."""
+    """Return the mean over the episodes with the seeds from 0."""
     return float(run_episodes(task, policy, episodes, 0).returns.mean())
 
 

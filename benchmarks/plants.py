@@ -1,10 +1,10 @@
-"""Train and compare on plants that nobody tuned, by the commands of docs/newcomer.md.
+"""Train and compare on plants without tuning, by the commands of docs/newcomer.md.
 
     python -m benchmarks.plants [PLANT …] [--output runs/plants] [--resume]
 
-The plants are those of ``benchmarks/plants.yaml`` and three that a seed draws. An agent trains by
-``linear_fusion_front``. At seven prices its cost, error + price · tokens, is compared with that of
-the best rule of ``scale_free_sweep`` there, with the same memory and on the same episodes.
+The plants are those of ``benchmarks/plants.yaml`` and three random ones. An agent trains by
+``linear_fusion_front``. At seven prices the table compares its cost, error + price · tokens, with
+the best rule of ``scale_free_sweep``, with the same memory and on the same episodes.
 """
 
 import argparse
@@ -34,7 +34,7 @@ ENV = "fusion_gym/LinearFusion-v2"
 
 
 def draw_plant(seed: int) -> dict[str, Any]:
-    """Return the options of a plant of two to four states with as many sensors or more."""
+    """Return the options of a random plant of two to four states with at least as many sensors."""
     generator = np.random.default_rng(seed)
     states, sensors = generator.integers([2, 3], [5, 6]).tolist()
     basis = generator.standard_normal((states, states)) + 2.0 * np.eye(states)
@@ -59,7 +59,7 @@ PLANTS |= {f"drawn_{seed}": draw_plant(seed) for seed in range(DRAWN)}
 
 @dataclass(frozen=True)
 class Row:
-    """A plant: processor seconds, tokens over what the bucket sustains, differences in cost."""
+    """A plant: processor seconds, tokens relative to the bucket's rate, differences in cost."""
 
     plant: str
     seconds: float
@@ -95,7 +95,7 @@ def main() -> None:
 
 
 def judge(name: str, arguments: argparse.Namespace) -> Row:
-    """Return the row of a plant, of the folder where its commands have run or run now."""
+    """Return the row of a plant, from its folder or a run."""
     folder = arguments.output / name
     stored = folder / "seconds.json"
     if not (arguments.resume and stored.exists()):
@@ -112,11 +112,7 @@ def judge(name: str, arguments: argparse.Namespace) -> Row:
 
 
 def run_commands(options: dict[str, Any], folder: Path, arguments: argparse.Namespace) -> float:
-    """Run the commands of the newcomer's page; the processor seconds that they took.
-
-    Raises:
-        RuntimeError: a command failed; the message ends with what it said.
-    """
+    """Run the commands of the newcomer's page, and return their processor seconds."""
     folder.mkdir(parents=True, exist_ok=True)
     plant, front = folder / "plant.yaml", folder / "front"
     plant.write_text(yaml.safe_dump(options))

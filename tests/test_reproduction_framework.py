@@ -47,7 +47,9 @@ def a_paper(name: str, calls: Calls) -> paper.Paper:
 
         def summarise(data: paper.Data) -> paper.Data:
             assert data["nested"] == {"list": [1.0, None]}
-            number = Number.of(f"mean of {piece}", data["sample"], printed=0.0, runs=10, unit="m")
+            number = Number.from_sample(
+                f"mean of {piece}", data["sample"], printed=0.0, runs=10, unit="m"
+            )
             return {"name": piece, "tables": {piece: [number]}}
 
         simulate.__qualname__ = f"simulate_{name}_{piece}"
@@ -191,7 +193,7 @@ def test_a_verdict_has_its_edge_where_it_says() -> None:
 
 def test_numbers_of_a_sample_have_its_moments() -> None:
     sample = np.random.default_rng(0).normal(3.0, 2.0, size=2000)
-    number = Number.of("x", sample, 3.0, 25, "m")
+    number = Number.from_sample("x", sample, 3.0, 25, "m")
     assert number.mean == pytest.approx(sample.mean())
     assert number.spread == pytest.approx(sample.std(ddof=1) / 5.0)
     half = 1.96 * sample.std(ddof=1) / np.sqrt(2000)
@@ -228,7 +230,7 @@ def test_a_page_has_all_that_is_shown(calls: Calls) -> None:
     sample = np.random.default_rng(2).normal(size=40)
     for table in numbers["tables"]:
         (entry,) = table["numbers"]
-        expected = Number.of(entry["what"], sample, 0.0, 10, "m")
+        expected = Number.from_sample(entry["what"], sample, 0.0, 10, "m")
         assert entry["mean"] == expected.mean
         assert entry["verdict"] == expected.verdict
         assert f"| {expected.mean:.4g} [{expected.low:.4g}, {expected.high:.4g}] m |" in text

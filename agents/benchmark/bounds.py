@@ -1,4 +1,4 @@
-"""What no policy of a class can undercut, where that is proven."""
+"""Proven lower bounds of the cost of every policy in a class."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
-class Bound(Job):
+class BoundJob(Job):
     """The proven lower bound of the cost at each price of a class."""
 
     prices: tuple[float, ...]
     weight: ClassVar[float] = 10.0
 
 
-def run_bound(job: Bound) -> tuple[float, ...]:
-    """Return the bound at each price; nothing for a setting to which it does not apply."""
+def run_bound(job: BoundJob) -> tuple[float, ...]:
+    """Return the bound at each price, or an empty tuple where it does not apply."""
     task = job.setting.task(job.name)
     try:
         return tuple(cost_bound(task, price).lower for price in job.prices)

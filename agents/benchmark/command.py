@@ -50,7 +50,7 @@ class Benchmark(Long):
     """Three settings, one seed and less of everything, in minutes."""
     policy: str | None = None
     """A policy to compare with the searched rule, in the place of all else."""
-    of: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
+    class_name: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
     """Class of the policy."""
     second_search: bool = False
     """Search three classes again with four times the generations, and compare, in the place of all
@@ -67,18 +67,14 @@ class Benchmark(Long):
     """Address of dask's scheduler; none begins a cluster of this machine."""
 
     def run(self) -> None:
-        """Do what is not finished, and write the results.
-
-        Raises:
-            ConfigurationError: a policy without a class, or a value that is not allowed.
-        """
+        """Run unfinished work, and write the results."""
         if self.second_search and self.policy is not None:
             raise refusal("second_search", True, "given without --policy")
-        if (self.policy is None) != (self.of is None):
-            raise refusal("class", self.of, "given with --policy, and only then")
+        if (self.policy is None) != (self.class_name is None):
+            raise refusal("class", self.class_name, "given with --policy, and only then")
         suite = load_suite(self.quick, self.settings)
-        if self.policy is not None and self.of is not None:
-            check_policy(suite, self.policy, self.of)
+        if self.policy is not None and self.class_name is not None:
+            check_policy(suite, self.policy, self.class_name)
         pool = Pool(self.workers, self.backend, self.address)
         work = self.work / ("quick" if self.quick else "full")
         folder = self.results or (work / "results" if self.quick else Path("results"))
@@ -87,8 +83,8 @@ class Benchmark(Long):
             runner = Runner(work.absolute(), pool)
             writing(("finished pieces of work", work))
             if self.second_search or self.policy is not None:
-                if self.policy is not None and self.of is not None:
-                    classes = evaluate_policy(suite, runner, self.policy, self.of)
+                if self.policy is not None and self.class_name is not None:
+                    classes = evaluate_policy(suite, runner, self.policy, self.class_name)
                 else:
                     classes = search_again(suite, runner)
                 print_classes(class_rows(classes), point_rows(suite, classes))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.benchmark.bounds import Bound, run_bound
+from agents.benchmark.bounds import BoundJob, run_bound
 from agents.benchmark.jobs import Runner
 from agents.benchmark.rules import SearchJob, SweepJob, SweepResult, rules_of, run_search, run_sweep
 from agents.benchmark.settings import (
@@ -23,11 +23,11 @@ from agents.benchmark.settings import (
     knowledge_of,
 )
 from agents.benchmark.tables import CaseRow, ChoiceRow, ClassRow, PointRow, TestRow
-from agents.benchmark.training import Training, run_training
+from agents.benchmark.training import TrainingJob, run_training
 from agents.benchmark.verdict import (
     Difference,
-    Test,
-    TestOutcome,
+    TestJob,
+    TestResult,
     cost_difference,
     discoveries,
     over_prices,
@@ -37,13 +37,13 @@ from fusion_gym.core.system import covers
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-TestOutcomes = tuple[TestOutcome, ...]
+TestResults = tuple[TestResult, ...]
 REFERENCE = "rule"
 
 
 @dataclass
-class Class:
-    """A class of a setting: what is known of it so far, by kind of policy and training seed."""
+class ClassEvidence:
+    """The results of a class of a setting, by kind of policy and training seed."""
 
     setting: Setting
     name: ClassName
@@ -51,21 +51,21 @@ class Class:
     memoryless: SweepResult | None = None
     rule: str = ""
     models: list[Path] = field(default_factory=list)
-    tests: dict[str, list[TestOutcomes]] = field(default_factory=dict)
-    validations: dict[str, list[TestOutcomes]] = field(default_factory=dict)
+    tests: dict[str, list[TestResults]] = field(default_factory=dict)
+    validations: dict[str, list[TestResults]] = field(default_factory=dict)
     bounds: tuple[float, ...] = ()
-    cases: dict[str, tuple[TestOutcomes, TestOutcomes]] = field(default_factory=dict)
+    cases: dict[str, tuple[TestResults, TestResults]] = field(default_factory=dict)
 
     @property
     def prices(self) -> tuple[float, ...]:
-        """Return the class's prices, from the lowest to the highest."""
+        """Prices of the class, in increasing order."""
         return self.sweep.prices
 
     def test(
         self, policies: Sequence[str], episodes: int, seed: int = TEST_SEED,
         case: Case | None = None, prices: Sequence[float] | None = None,
-    ) -> Test:  # fmt: skip
-        """Return the test of policies, one a price; an agent's file counts by its content."""
+    ) -> TestJob:  # fmt: skip
+        """Return the test of one policy per price; the key of an agent is its file's content."""
         own_prices = tuple(self.prices if prices is None else prices)
         texts = tuple(
             text.replace("{price}", f"{price!r}")
@@ -76,21 +76,21 @@ class Class:
         if agent:
             file = Path(texts[0].removeprefix("model:").rpartition(",price=")[0])
             content = hashlib.sha256(file.read_bytes()).hexdigest()
-        return Test(
+        return TestJob(
             self.setting, self.name, texts, own_prices, self.prices, episodes, seed, content,
             agent, None, case,
         )  # fmt: skip
 
     @property
     def best_agent(self) -> int:
-        """Return the training seed of the agent with the least cost in validation."""
+        """Training seed of the agent with the least cost in validation."""
         reference = self.validations[REFERENCE][0]
         scores = [over_prices([outcomes], reference).mean for outcomes in self.validations["agent"]]
         return int(np.argmin(scores))
 
     @property
     def choice(self) -> tuple[str, int]:
-        """Return the kind and the seed of the policy with the least cost in validation."""
+        """Kind and seed of the policy with the least cost in validation."""
         reference = self.validations[REFERENCE][0]
         scores = {
             (kind, seed): over_prices([outcomes], reference).mean
@@ -100,20 +100,22 @@ class Class:
         return min(scores, key=scores.__getitem__)
 
 
-def gather(suite: Suite, runner: Runner) -> list[Class]:
-    """Do what is not finished, and return all classes."""
+def gather(suite: Suite, runner: Runner) -> list[ClassEvidence]:
+    """Run unfinished work, and return all classes."""
     classes = find_prices(suite, runner)
     find_rules(suite, runner, classes)
     train_agents(suite, runner, classes)
-    jobs = [Bound(of.setting, of.name, of.prices) for of in classes]
-    for of, bounds in zip(classes, runner.run(run_bound, jobs, "bounds"), strict=True):
-        of.bounds = bounds
+    jobs = [BoundJob(entry.setting, entry.name, entry.prices) for entry in classes]
+    for entry, bounds in zip(classes, runner.run(run_bound, jobs, "bounds"), strict=True):
+        entry.bounds = bounds
     test_all(suite, runner, classes)
-    test_cases(suite, runner, [of for of in classes if of.name == "scheduler"])
+    test_cases(suite, runner, [entry for entry in classes if entry.name == "scheduler"])
     return classes
 
 
-def find_prices(suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASSES) -> list[Class]:
+def find_prices(
+    suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASSES
+) -> list[ClassEvidence]:
     """Tune the rules with one threshold, and freeze the prices of the classes."""
 
     def sweep(
@@ -125,93 +127,91 @@ def find_prices(suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASS
     places = [(setting, name) for setting in suite.settings for name in names]
     jobs = [sweep(setting, name, setting.has_memory(name)) for setting, name in places]
     results = runner.run(run_sweep, jobs, "single thresholds")
-    classes = [Class(*place, result) for place, result in zip(places, results, strict=True)]
-    others = [of for of in classes if of.setting.has_memory(of.name)]
-    jobs = [sweep(of.setting, of.name, False, of.prices) for of in others]
+    classes = [ClassEvidence(*place, result) for place, result in zip(places, results, strict=True)]
+    others = [entry for entry in classes if entry.setting.has_memory(entry.name)]
+    jobs = [sweep(entry.setting, entry.name, False, entry.prices) for entry in others]
     results = runner.run(run_sweep, jobs, "single thresholds without memory")
-    for of, result in zip(others, results, strict=True):
-        of.memoryless = result
+    for entry, result in zip(others, results, strict=True):
+        entry.memoryless = result
     return classes
 
 
-def find_rules(suite: Suite, runner: Runner, classes: Sequence[Class]) -> None:
+def find_rules(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
     """Search one rule for all prices of each class."""
     jobs = [
-        SearchJob(of.setting, of.name, of.prices, suite.generations, runner.folder / "searches")
-        for of in classes
+        SearchJob(
+            entry.setting, entry.name, entry.prices, suite.generations, runner.folder / "searches"
+        )
+        for entry in classes
     ]
-    for of, text in zip(classes, runner.run(run_search, jobs, "searches"), strict=True):
-        of.rule = f"{text},price={{price}}"
+    for entry, text in zip(classes, runner.run(run_search, jobs, "searches"), strict=True):
+        entry.rule = f"{text},price={{price}}"
 
 
-def train_agents(suite: Suite, runner: Runner, classes: Sequence[Class]) -> None:
-    """Train the agents of each class, one a seed."""
-    places = [(of, seed) for of in classes for seed in range(suite.training_seeds)]
+def train_agents(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
+    """Train one agent per class and seed."""
+    places = [(entry, seed) for entry in classes for seed in range(suite.training_seeds)]
     jobs = []
-    for of, seed in places:
-        folder = runner.folder / "agents" / f"{of.setting.name}_{of.name}_{seed}"
-        experiment = suite.experiment(of.setting, of.name, of.prices, seed)
-        jobs.append(Training(of.setting, of.name, experiment, folder))
+    for entry, seed in places:
+        folder = runner.folder / "agents" / f"{entry.setting.name}_{entry.name}_{seed}"
+        experiment = suite.experiment(entry.setting, entry.name, entry.prices, seed)
+        jobs.append(TrainingJob(entry.setting, entry.name, experiment, folder))
     runner.run(run_training, jobs, "trainings")
-    for (of, _), job in zip(places, jobs, strict=True):
-        of.models.append(job.model)
+    for (entry, _), job in zip(places, jobs, strict=True):
+        entry.models.append(job.model)
 
 
-def test_all(suite: Suite, runner: Runner, classes: Sequence[Class]) -> None:
+def test_all(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
     """Test every kind of policy on the test episodes, and rules and agents in validation."""
-    places: list[tuple[Class, str, bool]] = []
-    jobs: list[Test] = []
-    for of in classes:
-        for kind, policies in policies_of(of):
-            places.append((of, kind, True))
-            jobs.append(of.test(policies, suite.episodes))
+    places: list[tuple[ClassEvidence, str, bool]] = []
+    jobs: list[TestJob] = []
+    for entry in classes:
+        for kind, policies in policies_of(entry):
+            places.append((entry, kind, True))
+            jobs.append(entry.test(policies, suite.episodes))
             if kind in (REFERENCE, "agent"):
-                places.append((of, kind, False))
-                jobs.append(of.test(policies, suite.validation_episodes, VALIDATION_SEED))
-    for (of, kind, final), outcomes in zip(
+                places.append((entry, kind, False))
+                jobs.append(entry.test(policies, suite.validation_episodes, VALIDATION_SEED))
+    for (entry, kind, final), outcomes in zip(
         places, runner.run(run_test, jobs, "tests"), strict=True
     ):
-        tests = of.tests if final else of.validations
+        tests = entry.tests if final else entry.validations
         tests.setdefault(kind, []).append(outcomes)
 
 
-def policies_of(of: Class) -> Iterator[tuple[str, list[str]]]:
-    """Yield the policies of a class, one a price, with their kind."""
-    count = len(of.prices)
-    yield REFERENCE, [of.rule] * count
-    yield "threshold", [of.sweep.best(price).policy for price in of.prices]
-    trigger = of.setting.trigger.policy
-    if any(tuned.rule == trigger for tuned in of.sweep.tuned):
-        yield "trigger", [of.sweep.best(price, trigger).policy for price in of.prices]
-    if of.setting.optimum is not None and of.name == "scheduler":
-        yield "optimum", [of.setting.optimum] * count
-    for model in of.models:
+def policies_of(entry: ClassEvidence) -> Iterator[tuple[str, list[str]]]:
+    """Yield the kinds of policy of a class, each with one policy per price."""
+    count = len(entry.prices)
+    yield REFERENCE, [entry.rule] * count
+    yield "threshold", [entry.sweep.best(price).policy for price in entry.prices]
+    trigger = entry.setting.trigger.policy
+    if any(tuned.rule == trigger for tuned in entry.sweep.tuned):
+        yield "trigger", [entry.sweep.best(price, trigger).policy for price in entry.prices]
+    if entry.setting.optimum is not None and entry.name == "scheduler":
+        yield "optimum", [entry.setting.optimum] * count
+    for model in entry.models:
         yield "agent", [f"model:{model},price={{price}}"] * count
 
 
-def test_cases(suite: Suite, runner: Runner, classes: Sequence[Class]) -> None:
-    """Test the rule, and the agent that validation prefers, in every perturbed case."""
-    places: list[tuple[Class, str]] = []
-    jobs: list[Test] = []
-    for of in classes:
-        agent = f"model:{of.models[of.best_agent]},price={{price}}"
-        prices = of.prices[1:4]  # the middle ones
-        for case in (None, *suite.cases_of(of.setting)):
-            places.append((of, "as assumed" if case is None else case.name))
-            for text in (of.rule, agent):
+def test_cases(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
+    """Test the rule, and the agent with the least validation cost, in every perturbed case."""
+    places: list[tuple[ClassEvidence, str]] = []
+    jobs: list[TestJob] = []
+    for entry in classes:
+        agent = f"model:{entry.models[entry.best_agent]},price={{price}}"
+        prices = entry.prices[1:4]  # the middle ones
+        for case in (None, *suite.cases_of(entry.setting)):
+            places.append((entry, "as assumed" if case is None else case.name))
+            for text in (entry.rule, agent):
                 policies = [text] * len(prices)
-                jobs.append(of.test(policies, suite.case_episodes, case=case, prices=prices))
+                jobs.append(entry.test(policies, suite.case_episodes, case=case, prices=prices))
     results = runner.run(run_test, jobs, "perturbed cases")
-    for place, (of, name) in enumerate(places):
-        of.cases[name] = results[2 * place], results[2 * place + 1]
+    for place, (entry, name) in enumerate(places):
+        entry.cases[name] = results[2 * place], results[2 * place + 1]
 
 
 def check_policy(suite: Suite, text: str, name: ClassName) -> None:
-    """Check that a policy exists in every setting, and knows no more than a class.
-
-    Raises:
-        ConfigurationError: it does not, or it looks at more than its class knows.
-    """
+    """Refuse a policy that does not exist in every setting, or knows more than its class."""
     for setting in suite.settings:
         policy, knower = (
             make_policy(text.replace("{price}", "1.0"), setting.task(name)),
@@ -224,124 +224,133 @@ def check_policy(suite: Suite, text: str, name: ClassName) -> None:
             )
 
 
-def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) -> list[Class]:
-    """Test anybody's policy in a class of every setting, beside the searched rule."""
+def evaluate_policy(
+    suite: Suite, runner: Runner, text: str, name: ClassName
+) -> list[ClassEvidence]:
+    """Test a policy in a class of every setting, together with the searched rule."""
     classes = find_prices(suite, runner, (name,))
     find_rules(suite, runner, classes)
-    kinds = {REFERENCE: [of.rule for of in classes], "policy": [text] * len(classes)}
+    kinds = {REFERENCE: [entry.rule for entry in classes], "policy": [text] * len(classes)}
     test_texts(suite, runner, classes, kinds)
     return classes
 
 
-def search_again(suite: Suite, runner: Runner) -> list[Class]:
-    """Search three classes, drawn by a seed, with four times the generations and other episodes."""
+def search_again(suite: Suite, runner: Runner) -> list[ClassEvidence]:
+    """Search three random classes with four times the generations and other episodes."""
     classes = find_prices(suite, runner)
     find_rules(suite, runner, classes)
     drawn = np.random.default_rng(0).choice(len(classes), min(3, len(classes)), replace=False)
     classes = [classes[place] for place in sorted(drawn)]
+    generations = 4 * suite.generations
     jobs = [
-        SearchJob(of.setting, of.name, of.prices, 4 * suite.generations, runner.folder / "searches",
-                  2_000_000_000)
-        for of in classes
-    ]  # fmt: skip
+        SearchJob(
+            c.setting, c.name, c.prices, generations, runner.folder / "searches", 2_000_000_000
+        )
+        for c in classes
+    ]
     texts = [f"{text},price={{price}}" for text in runner.run(run_search, jobs, "second searches")]
-    test_texts(suite, runner, classes, {REFERENCE: [of.rule for of in classes], "second": texts})
+    test_texts(
+        suite, runner, classes, {REFERENCE: [entry.rule for entry in classes], "second": texts}
+    )
     return classes
 
 
 def test_texts(
-    suite: Suite, runner: Runner, classes: Sequence[Class], kinds: dict[str, list[str]]
+    suite: Suite, runner: Runner, classes: Sequence[ClassEvidence], kinds: dict[str, list[str]]
 ) -> None:
-    """Test one policy for each class, at all prices, of every kind."""
+    """Test one policy of every kind for each class, at all prices."""
     for kind, texts in kinds.items():
         jobs = [
-            of.test([text] * len(of.prices), suite.episodes)
-            for of, text in zip(classes, texts, strict=True)
+            entry.test([text] * len(entry.prices), suite.episodes)
+            for entry, text in zip(classes, texts, strict=True)
         ]
-        for of, outcomes in zip(classes, runner.run(run_test, jobs, kind), strict=True):
-            of.tests[kind] = [outcomes]
+        for entry, outcomes in zip(classes, runner.run(run_test, jobs, kind), strict=True):
+            entry.tests[kind] = [outcomes]
 
 
-def policy_rows(suite: Suite, classes: Sequence[Class]) -> list[TestRow]:
+def policy_rows(suite: Suite, classes: Sequence[ClassEvidence]) -> list[TestRow]:
     """Return a row for every policy at every price."""
     return [
         TestRow(
-            of.setting.name, of.name, kind, seed, share, o.price, float(o.cost.mean()),
+            entry.setting.name, entry.name, kind, seed, share, o.price, float(o.cost.mean()),
             float(o.error.mean()), float(o.tokens.mean()), o.mse, o.rate,
             "" if kind == "agent" else o.policy,
         )
-        for of in classes
-        for kind, every in of.tests.items()
+        for entry in classes
+        for kind, every in entry.tests.items()
         for seed, outcomes in enumerate(every)
         for share, o in zip(suite.shares, outcomes, strict=True)
     ]  # fmt: skip
 
 
-def point_rows(suite: Suite, classes: Sequence[Class]) -> list[PointRow]:
-    """Return every difference to the searched rule, price by price."""
-    places: list[tuple[Class, str, float, float]] = []
+def point_rows(suite: Suite, classes: Sequence[ClassEvidence]) -> list[PointRow]:
+    """Return the difference to the searched rule at every price."""
+    places: list[tuple[ClassEvidence, str, float, float]] = []
     results: list[Difference] = []
-    for of in classes:
-        reference = of.tests[REFERENCE][0]
-        for kind, every in of.tests.items():
+    for entry in classes:
+        reference = entry.tests[REFERENCE][0]
+        for kind, every in entry.tests.items():
             if kind == REFERENCE:
                 continue
-            for place, price in enumerate(of.prices):
+            for place, price in enumerate(entry.prices):
                 costs = [outcomes[place].cost for outcomes in every]
-                places.append((of, kind, suite.shares[place], price))
+                places.append((entry, kind, suite.shares[place], price))
                 results.append(cost_difference(costs, reference[place].cost))
     counts = discoveries([item.p for item in results])
     return [
-        PointRow(of.setting.name, of.name, kind, share, price, d.mean, d.low, d.high, counted)
-        for (of, kind, share, price), d, counted in zip(places, results, counts, strict=True)
+        PointRow(entry.setting.name, entry.name, kind, share, price, d.mean, d.low, d.high, counted)
+        for (entry, kind, share, price), d, counted in zip(places, results, counts, strict=True)
     ]
 
 
-def class_rows(classes: Sequence[Class]) -> list[ClassRow]:
-    """Return every mean difference to the searched rule over a class's prices.
+def class_rows(classes: Sequence[ClassEvidence]) -> list[ClassRow]:
+    """Return the mean difference to the searched rule over a class's prices.
 
-    The proven bound stands there as a kind of its own, without an interval.
+    The proven bound is a kind of its own, without an interval.
     """
     rows = [
-        ClassRow(of.setting.name, of.name, kind, d.mean, d.low, d.high)
-        for of in classes
-        for kind, every in of.tests.items()
+        ClassRow(entry.setting.name, entry.name, kind, d.mean, d.low, d.high)
+        for entry in classes
+        for kind, every in entry.tests.items()
         if kind != REFERENCE
-        for d in [over_prices(every, of.tests[REFERENCE][0])]
+        for d in [over_prices(every, entry.tests[REFERENCE][0])]
     ]
-    for of in classes:
-        if of.bounds:
-            costs = [float(outcome.cost.mean()) for outcome in of.tests[REFERENCE][0]]
-            below = float(np.mean(np.divide(of.bounds, costs))) - 1.0
-            rows.append(ClassRow(of.setting.name, of.name, "bound", below, below, below))
+    for entry in classes:
+        if entry.bounds:
+            costs = [float(outcome.cost.mean()) for outcome in entry.tests[REFERENCE][0]]
+            below = float(np.mean(np.divide(entry.bounds, costs))) - 1.0
+            rows.append(ClassRow(entry.setting.name, entry.name, "bound", below, below, below))
     return rows
 
 
-def choice_rows(classes: Sequence[Class]) -> list[ChoiceRow]:
-    """Return what validation chooses in each class, and what memory is worth there."""
+def choice_rows(classes: Sequence[ClassEvidence]) -> list[ChoiceRow]:
+    """Return the policy of each class with the least validation cost, and the effect of memory."""
     rows = []
-    for of in classes:
-        kind, seed = of.choice
-        d = over_prices([of.tests[kind][seed]], of.tests[REFERENCE][0])
+    for entry in classes:
+        kind, seed = entry.choice
+        d = over_prices([entry.tests[kind][seed]], entry.tests[REFERENCE][0])
         memory = float("nan")
-        if of.memoryless is not None:
+        if entry.memoryless is not None:
             costs = [
-                of.memoryless.best(price).cost / of.sweep.best(price).cost for price in of.prices
+                entry.memoryless.best(price).cost / entry.sweep.best(price).cost
+                for price in entry.prices
             ]
             memory = float(np.mean(costs)) - 1.0
         rows.append(
-            ChoiceRow(of.setting.name, of.name, kind, d.mean, d.low, d.high, memory, of.rule)
+            ChoiceRow(
+                entry.setting.name, entry.name, kind, d.mean, d.low, d.high, memory, entry.rule
+            )
         )
     return rows
 
 
-def case_rows(classes: Sequence[Class]) -> list[CaseRow]:
-    """Return the rule and the agent of every scheduler in the perturbed cases."""
+def case_rows(classes: Sequence[ClassEvidence]) -> list[CaseRow]:
+    """Return the costs of every scheduler's rule and agent in the perturbed cases."""
     rows = []
-    for of in classes:
-        for case, (rule, agent) in of.cases.items():
-            base = of.cases["as assumed"][0]
+    for entry in classes:
+        for case, (rule, agent) in entry.cases.items():
+            base = entry.cases["as assumed"][0]
             d = over_prices([agent], rule)
             change = over_prices([rule], base).mean
-            rows.append(CaseRow(of.setting.name, case, change, d.mean, d.low, d.high))
+            rows.append(CaseRow(entry.setting.name, case, change, d.mean, d.low, d.high))
     return rows

@@ -1,4 +1,4 @@
-"""Pieces of work: frozen dataclasses whose fields are all that a result depends on."""
+"""Jobs of the benchmark: frozen dataclasses whose fields determine the result."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _PLAIN: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(Any)
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work in a class of a setting; ``weight`` is about its seconds on one core.
+    """A job in a class of a setting; ``weight`` is about its seconds on one core.
 
-    A field with the metadata ``key`` false says where it works, not what comes out.
+    A field with the metadata ``key`` false has no effect on the result.
     """
 
     setting: Setting
@@ -42,19 +42,19 @@ class Job:
 
 @dataclass(frozen=True)
 class Runner:
-    """The folder of finished pieces, and the processes that do the others."""
+    """The folder of results, and the processes that compute missing ones."""
 
     folder: Path
     pool: Pool
 
     @property
     def cache(self) -> Cache:
-        """Return the results that are finished."""
+        """Results in the folder."""
         return Cache(self.folder / "jobs")
 
     def run(
         self, work: Callable[[AnyJob], Result], jobs: Sequence[AnyJob], title: str
     ) -> list[Result]:
-        """Return the results of jobs in their order, from the folder or computed now."""
+        """Return the results of jobs in their order, from the folder or computed."""
         side_by_side(missing(work, jobs, self.cache), self.pool, title)
         return [self.cache.read(work, job.inputs) for job in jobs]

@@ -1,4 +1,4 @@
-"""The benchmark's page, figures and tables, of its rows."""
+"""The benchmark's page, figures and tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from rich.table import Table
 
 from agents.benchmark.evidence import (
-    Class,
+    ClassEvidence,
     case_rows,
     choice_rows,
     class_rows,
@@ -47,20 +47,20 @@ LINES = {  # kind: label, colour, marker
 }
 
 
-def write_results(suite: Suite, classes: Sequence[Class], folder: Path) -> None:
-    """Write all tables, a figure a setting, and the page; README's table with the full results."""
+def write_results(suite: Suite, classes: Sequence[ClassEvidence], folder: Path) -> None:
+    """Write all tables, a figure per setting, the page, and README's table."""
     folder.mkdir(parents=True, exist_ok=True)
     policies, points = policy_rows(suite, classes), point_rows(suite, classes)
     means, choices = class_rows(classes), choice_rows(classes)
-    cases = case_rows([of for of in classes if of.name == "scheduler"])
+    cases = case_rows([entry for entry in classes if entry.name == "scheduler"])
     for rows in (policies, points, means, choices, cases):
         write_rows(folder, rows)
     for setting in suite.settings:
         own = [row for row in policies if row.setting == setting.name]
         draw_setting(own, setting.title, folder / f"{setting.name}.png")
-    for of in classes:
-        if (of.setting.name, of.name) == HEADLINE:
-            draw_headline(policies, of, folder / "readme.png")
+    for entry in classes:
+        if (entry.setting.name, entry.name) == HEADLINE:
+            draw_headline(policies, entry, folder / "readme.png")
     titles = {setting.name: setting.title for setting in suite.settings}
     headline = headline_text(titles, means)
     page = [
@@ -105,10 +105,11 @@ def relative_text(row: ClassRow | PointRow | ChoiceRow | object) -> str:
 
 
 def headline_text(titles: dict[str, str], rows: Sequence[ClassRow]) -> str:
-    """Return the table of agents over searched rules, a setting a row and a class a column."""
+    """Return the table of agents relative to searched rules, settings by classes."""
     agents = {(row.setting, row.name): relative_text(row) for row in rows if row.kind == "agent"}
     cells = (
-        (title, *(agents.get((name, of), "–") for of in CLASSES)) for name, title in titles.items()
+        (title, *(agents.get((name, column), "–") for column in CLASSES))
+        for name, title in titles.items()
     )
     head = ("cost of agents over the searched rule's, %", *TITLES.values())
     medians = {
@@ -126,7 +127,7 @@ def headline_text(titles: dict[str, str], rows: Sequence[ClassRow]) -> str:
 def class_table(
     titles: dict[str, str], rows: Sequence[ClassRow], choices: Sequence[ChoiceRow]
 ) -> str:
-    """Return every kind of policy over the searched rule, a class a row."""
+    """Return the table of every kind of policy relative to the searched rule."""
     by_kind = {(row.setting, row.name, row.kind): relative_text(row) for row in rows}
     kinds = [kind for kind in LINES if kind != "rule"]
     lines = []
@@ -140,7 +141,7 @@ def class_table(
 
 
 def sentences(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> list[str]:
-    """Return what the search gains over published rules, and what agents add, and where."""
+    """Return the sentences on the gains of the search and of agents."""
 
     def mean(kind: str) -> str:
         values = [row.difference for row in rows if row.kind == kind]
@@ -173,7 +174,7 @@ def sentences(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> list[str]
 
 
 def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
-    """Draw error against tokens a step, one panel a class."""
+    """Draw error against tokens per step, one panel per class."""
     plt.rcParams.update(READABLE)
     names = list(dict.fromkeys(row.name for row in rows))
     figure, panels = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.6), squeeze=False)
@@ -187,26 +188,26 @@ def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
     save_figure(figure, path)
 
 
-def draw_headline(rows: Sequence[TestRow], of: Class, path: Path) -> None:
+def draw_headline(rows: Sequence[TestRow], entry: ClassEvidence, path: Path) -> None:
     """Draw one class and its proven bound: error >= max over prices of (bound - price · tokens)."""
     plt.rcParams.update(READABLE)
     figure, panel = plt.subplots(figsize=(7.0, 4.4))
     draw_class(
-        panel, [row for row in rows if (row.setting, row.name) == (of.setting.name, of.name)]
+        panel, [row for row in rows if (row.setting, row.name) == (entry.setting.name, entry.name)]
     )
-    if of.bounds:
+    if entry.bounds:
         label, colour, _ = LINES["bound"]
         tokens = np.geomspace(*panel.get_xlim(), 200)
-        errors = np.max(np.array(of.bounds) - np.multiply.outer(tokens, of.prices), axis=1)
+        errors = np.max(np.array(entry.bounds) - np.multiply.outer(tokens, entry.prices), axis=1)
         panel.plot(tokens[errors > 0], errors[errors > 0], "--", color=colour, label=label)
-    panel.set(ylabel=ERROR, title=f"{of.setting.title}, {TITLES[of.name]}")
+    panel.set(ylabel=ERROR, title=f"{entry.setting.title}, {TITLES[entry.name]}")
     panel.legend()
     figure.tight_layout()
     save_figure(figure, path)
 
 
 def draw_class(panel: Axes, rows: Sequence[TestRow]) -> None:
-    """Draw error against tokens a step in one class, a line for each policy and seed."""
+    """Draw error against tokens per step in one class, a line for each policy and seed."""
     for kind, (label, colour, marker) in LINES.items():
         own = [row for row in rows if row.kind == kind]
         for seed in sorted({row.seed for row in own}):
@@ -220,7 +221,7 @@ def draw_class(panel: Axes, rows: Sequence[TestRow]) -> None:
 
 
 def print_classes(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> None:
-    """Print the mean differences to the searched rule, and those at each price."""
+    """Print the mean differences to the searched rule, and the difference at each price."""
     shares = sorted({point.share for point in points}, reverse=True)
     heads = ("setting", "class", "kind", "all prices", *(f"{share:.0%}" for share in shares))
     result = Table(*heads, title="cost over the searched rule's, %; negative: cheaper")

@@ -37,7 +37,7 @@ NEAR = 1.1  # rules whose cost is so near the least, as a factor, are tuned fine
 
 @dataclass(frozen=True)
 class SweepJob(Job):
-    """Every rule of a class over its thresholds; with ``prices`` finer about the best ones."""
+    """Every rule of a class over its thresholds, with ``prices`` on a finer grid near the best."""
 
     memory: bool
     rules: tuple[ThresholdRule, ...]
@@ -48,7 +48,7 @@ class SweepJob(Job):
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TunedRule:
     """The best threshold of a rule at a price, and its cost on the tuning episodes."""
 
     rule: str
@@ -59,13 +59,13 @@ class Tuned:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """The prices of a class, frozen, and every rule's best threshold at each."""
+    """The frozen prices of a class, and every rule's best threshold at each."""
 
     prices: tuple[float, ...]
-    tuned: tuple[Tuned, ...]
+    tuned: tuple[TunedRule, ...]
 
-    def best(self, price: float, rule: str | None = None) -> Tuned:
-        """Return the best of all rules at a price, or of one."""
+    def best(self, price: float, rule: str | None = None) -> TunedRule:
+        """Return the best of all rules at a price, or the best threshold of one rule."""
         own = (t for t in self.tuned if t.price == price and rule in (None, t.rule))
         return min(own, key=lambda item: item.cost)
 
@@ -82,7 +82,7 @@ class SearchJob(Job):
 
 
 def run_sweep(job: SweepJob) -> SweepResult:
-    """Tune every rule of a class on the tuning episodes, and find the prices where none are."""
+    """Tune every rule of a class on the tuning episodes, and choose missing prices."""
     task = job.setting.task(job.name, job.memory)
     trials = {
         rule: _try(task, rule, np.geomspace(*rule.ends, COUNT), job.episodes[0])
@@ -96,7 +96,7 @@ def run_sweep(job: SweepJob) -> SweepResult:
         for rule, trial in best.items():
             if trial.cost(price) <= NEAR * least or rule == job.setting.trigger:
                 trial = _finer(task, job, rule, trials[rule], trial, price)
-            tuned.append(Tuned(rule.policy, price, trial.policy, trial.cost(price)))
+            tuned.append(TunedRule(rule.policy, price, trial.policy, trial.cost(price)))
     return SweepResult(prices, tuple(tuned))
 
 
@@ -135,7 +135,7 @@ def _finer(
     task: Task, job: SweepJob, rule: ThresholdRule, own: Sequence[ThresholdTrial],
     best: ThresholdTrial, price: float,
 ) -> ThresholdTrial:  # fmt: skip
-    """Return the best of thresholds between the neighbours of the best one, on more episodes."""
+    """Return the best threshold between the neighbours of the best one, on more episodes."""
     place = own.index(best)
     ends = own[max(place - 1, 0)].threshold, own[min(place + 1, len(own) - 1)].threshold
     trials = _try(task, rule, np.geomspace(*ends, FINER), job.episodes[1])
@@ -143,7 +143,7 @@ def _finer(
 
 
 def run_search(job: SearchJob) -> str:
-    """Return the searched rule's line of text; generations stay in the folder until the end."""
+    """Return the searched rule as text; the folder holds unfinished generations."""
     task = job.setting.task(job.name)
     search = search_of_class(job.name, task, job.prices, generations=job.generations, seed=job.seed)
     state = job.folder / f"{job.setting.name}_{job.name}_{job.seed}.json"

@@ -42,7 +42,7 @@ class Case(Strict):
 
 
 class Setting(Strict):
-    """An environment with options, its paper's trigger, and how long its agents are trained.
+    """An environment with options, its paper's trigger, and the length of its trainings.
 
     ``optimum`` is a policy with ``{price}``.
     """
@@ -66,7 +66,7 @@ class Setting(Strict):
         return self.memory and name != "centre"
 
     def task(self, name: ClassName, memory: bool | None = None, case: Case | None = None) -> Task:
-        """Return the task of a class's rules, by default with its memory and without a case."""
+        """Return the task of a class's rules, by default with memory and without a case."""
         memory = self.has_memory(name) if memory is None else memory
         options = self.options | ({"memory": True} if memory else {})
         return make_task(self.environment, **_perturbed(options, case))
@@ -74,7 +74,7 @@ class Setting(Strict):
     def agent_environment(
         self, name: ClassName, price_range: tuple[float, float], case: Case | None = None
     ) -> Options:
-        """Return the options of the environment in which an agent of a class decides."""
+        """Return the environment options of an agent of a class."""
         options = self.options | self.agent_options
         options |= {"cost_weight": "random", "price_range": list(price_range)}
         if name == "centre":
@@ -109,7 +109,7 @@ class Suite(Strict):
     def experiment(
         self, setting: Setting, name: ClassName, prices: tuple[float, ...], seed: int
     ) -> Experiment:
-        """Return the training of one agent, which sees a price drawn for each episode."""
+        """Return the training of one agent, whose price is random in each episode."""
         timesteps = max(round(setting.timesteps * self.steps), 1)
         return Experiment(
             environment=EnvironmentConfig(
@@ -131,11 +131,7 @@ class Suite(Strict):
 
 
 def load_suite(quick: bool = False, settings: tuple[str, ...] = ()) -> Suite:
-    """Return the benchmark, or its quick version, with the settings of these names or all.
-
-    Raises:
-        ConfigurationError: unreadable, a value that is not allowed, or an unknown setting.
-    """
+    """Return the benchmark, or its quick version, with the named settings or all."""
     content = read_yaml(FILE)
     changes = content.pop("quick")
     by_name = {setting["name"]: setting for setting in content["settings"]}
@@ -147,7 +143,7 @@ def load_suite(quick: bool = False, settings: tuple[str, ...] = ()) -> Suite:
 
 
 def knowledge_of(setting: Setting, name: ClassName) -> Knowledge:
-    """Return what a policy of a class may know."""
+    """Return the knowledge class of a class's policies."""
     if name == "centre":
         return "centre"
     memory = setting.has_memory(name)

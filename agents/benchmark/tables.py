@@ -17,7 +17,7 @@ Row = TypeVar("Row")
 
 @dataclass(frozen=True)
 class TestRow:
-    """A policy at a price, on the test episodes: means over episodes of a step's figures."""
+    """A policy at a price on the test episodes: means per step."""
 
     setting: str
     name: str  # of the class
@@ -35,7 +35,7 @@ class TestRow:
 
 @dataclass(frozen=True)
 class PointRow:
-    """The cost of a kind of policy at a price over the searched rule's, minus 1."""
+    """The cost of a kind of policy at a price, relative to the searched rule's, minus 1."""
 
     setting: str
     name: str
@@ -50,7 +50,7 @@ class PointRow:
 
 @dataclass(frozen=True)
 class ClassRow:
-    """The mean over a class's prices of the same differences."""
+    """The mean of these differences over a class's prices."""
 
     setting: str
     name: str
@@ -62,10 +62,10 @@ class ClassRow:
 
 @dataclass(frozen=True)
 class ChoiceRow:
-    """The policy of a class that validation chooses, and the gain by memory of single thresholds.
+    """The policy of a class with the least validation cost, and the effect of memory.
 
-    ``memory`` is the cost without memory over that with it, minus 1, on the tuning episodes; NaN
-    where a class has none.
+    ``memory`` is the cost of single thresholds without memory over their cost with it, minus 1, on
+    the tuning episodes; NaN for a class without memory.
     """
 
     setting: str
@@ -100,7 +100,7 @@ KINDS: dict[type, str] = {
 
 
 def write_rows(folder: Path, rows: Sequence[object]) -> None:
-    """Write rows of one kind into the folder, as the CSV file of their kind."""
+    """Write rows of one kind as a CSV file into the folder."""
     kind = type(rows[0])
     with replacing(folder / f"{KINDS[kind]}.csv") as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, [item.name for item in fields(kind)], lineterminator="\n")  # type: ignore[arg-type]
@@ -111,11 +111,7 @@ def write_rows(folder: Path, rows: Sequence[object]) -> None:
 
 
 def read_rows(folder: Path, kind: type[Row]) -> list[Row]:
-    """Return the rows of a kind.
-
-    Raises:
-        FileNotFoundError: no such table.
-    """
+    """Return the rows of a kind."""
     adapter = pydantic.TypeAdapter(list[kind])  # type: ignore[valid-type]
     with (folder / f"{KINDS[kind]}.csv").open(newline="") as file:
         return adapter.validate_python(list(csv.DictReader(file)))

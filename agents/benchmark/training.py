@@ -1,4 +1,4 @@
-"""Agents of a class: one training a seed, from nothing, at prices over the class's range."""
+"""Agents of a class: one training per seed, at random prices of the class's range."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fusion_gym.training.run import holds_training, train
 
 
 @dataclass(frozen=True)
-class Training(Job):
+class TrainingJob(Job):
     """One agent; its checkpoints and model are in the experiment's folder."""
 
     experiment: Experiment
@@ -27,12 +27,8 @@ class Training(Job):
         return self.folder / "best_model.zip"
 
 
-def run_training(job: Training) -> float:
-    """Train as far as it is not, and return the processor seconds.
-
-    Raises:
-        KeyboardInterrupt: the training was interrupted.
-    """
+def run_training(job: TrainingJob) -> float:
+    """Train or continue, and return the processor seconds."""
     torch.set_num_threads(1)
     experiment = job.experiment.model_copy(update={"output": str(job.folder)})
     summary = train(experiment, resume=holds_training(job.folder), quiet=True)

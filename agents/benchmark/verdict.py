@@ -1,4 +1,4 @@
-"""Policies on the test episodes, and what they cost beside the searched rule, at equal price."""
+"""Tests of policies, and their cost relative to the searched rule at equal price."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ FALSE_DISCOVERIES = 0.05
 
 
 @dataclass(frozen=True)
-class Test(Job):
-    """A policy at each price, on episodes from a seed on; ``{price}`` in its text is filled in.
+class TestJob(Job):
+    """A policy at each price, on episodes from a first seed.
 
-    ``content`` is the text of all policies, or the hash of an agent's file. An agent decides in the
-    class's environment for agents, which ``class_prices`` span; a rule in that for rules.
+    ``content`` is the text of all policies, or the hash of an agent's file. An agent runs in the
+    class's environment for agents, whose price range is ``class_prices``; a rule runs in the
+    environment for rules.
     """
 
     __test__: ClassVar[bool] = False
@@ -42,7 +43,7 @@ class Test(Job):
     weight: ClassVar[float] = 20.0
 
     def task(self) -> Task:
-        """Return the task in which it runs."""
+        """Return the task of the test."""
         if not self.agent:
             return self.setting.task(self.name, self.memory, self.case)
         span = min(self.class_prices), max(self.class_prices)
@@ -51,8 +52,8 @@ class Test(Job):
 
 
 @dataclass(frozen=True)
-class TestOutcome:
-    """A policy at a price: its error and its tokens a step in each episode, MSE and rate."""
+class TestResult:
+    """A policy at a price: error and tokens per step of each episode, MSE and rate."""
 
     policy: str
     price: float
@@ -67,14 +68,14 @@ class TestOutcome:
         return self.error + self.price * self.tokens
 
 
-def run_test(job: Test) -> tuple[TestOutcome, ...]:
-    """Return what each policy does at its price."""
+def run_test(job: TestJob) -> tuple[TestResult, ...]:
+    """Return the result of each policy at its price."""
     task, result = job.task(), []
     for text, price in zip(job.policies, job.prices, strict=True):
         policy = make_policy(text, task)
         results = run_episodes(task, policy, job.episodes, job.seed)
         rate, mse = float(results.rate.mean()), float(results.mse.mean())
-        result.append(TestOutcome(text, price, results.error_cost, results.tokens, mse, rate))
+        result.append(TestResult(text, price, results.error_cost, results.tokens, mse, rate))
     return tuple(result)
 
 
@@ -89,11 +90,11 @@ class Difference:
 
 
 def cost_difference(costs: Sequence[Array], reference: Array) -> Difference:
-    """Return the difference of costs (E,) of one or more seeds to a reference's (E,), relative.
+    """Return the relative difference of costs (E,) of one or more seeds to a reference's (E,).
 
     Seeds and episodes are crossed random factors: the variance of the mean is the seed means'
-    variance over their number plus the episode means' over theirs, with Satterthwaite's
-    degrees of freedom.
+    variance over their number plus the episode means' over theirs, with Satterthwaite's degrees of
+    freedom.
     """
     values = (np.array(costs) - reference) / reference.mean()
     seeds, episodes = values.shape
@@ -112,9 +113,9 @@ def cost_difference(costs: Sequence[Array], reference: Array) -> Difference:
 
 
 def over_prices(
-    outcomes: Sequence[Sequence[TestOutcome]], reference: Sequence[TestOutcome]
+    outcomes: Sequence[Sequence[TestResult]], reference: Sequence[TestResult]
 ) -> Difference:
-    """Return the mean over the prices of the relative difference, of one or more seeds."""
+    """Return the mean relative difference over the prices, of one or more seeds."""
     relative = [
         np.mean([o.cost / r.cost.mean() for o, r in zip(seed, reference, strict=True)], axis=0)
         for seed in outcomes

@@ -59,8 +59,8 @@ AT_BOUND, OTHERS, ALWAYS = "at the bounds", "requests of another episode", "alwa
 class _Reading:
     """A trigger with another threshold or another innovation; one object for each batch.
 
-    ``threshold`` takes the sizes |ε| at the last request and now, and is compared with the
-    size's ``power``.
+    ``threshold`` is a function of the sizes |ε| at the last request and now; the rule compares it
+    with the size's ``power``.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ def _summarise_rates(data: Data) -> Data:
     by = dict(zip(readings, rates, strict=True))
     ours = by[OURS]
     numbers = [
-        Number.of(f"{name}, rate", 100.0 * sample, 100.0 * printed, unit="%")
+        Number.from_sample(f"{name}, rate", 100.0 * sample, 100.0 * printed, unit="%")
         for name, sample, printed in zip(SENSORS, ours, PRINTED, strict=True)
     ]
     far = np.abs(100.0 * (rates.mean(-1) - np.array(PRINTED))).max(1)
@@ -163,7 +163,7 @@ def _summarise_rates(data: Data) -> Data:
         "tables": {
             "rates": numbers,
             "readings": [
-                Number.of(f"{reading}: {name}", 100.0 * sample, unit="%")
+                Number.from_sample(f"{reading}: {name}", 100.0 * sample, unit="%")
                 for reading, samples in by.items()
                 if reading not in (OURS, FIXED, TIMED)
                 for name, sample in zip(SENSORS, samples, strict=True)
@@ -189,9 +189,9 @@ def _summarise_rates(data: Data) -> Data:
 
 
 def _of_other_episodes(episodes: int) -> Ask:
-    """What the trigger requests in the next episode of the first lane.
+    """Return the trigger's requests in the next episode of the first lane.
 
-    The same rates and patterns of requests, but independent of the episode's own noise.
+    They have the same rates and patterns, and are independent of the episode's own noise.
     """
 
     def ask(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -212,10 +212,10 @@ def simulate_fusion(
     lanes: Sequence[str] = ("bounds", "scales", "others"),
     fusions: Sequence[str] = FUSIONS,
 ) -> Data:
-    """Return everything that Figures 4 to 9 and their claims need, by fusion rule.
+    """Return the data of Figures 4 to 9 and their claims, by fusion rule.
 
     See :class:`ErrorRecord`. ``lanes`` are groups: the trigger at the bounds of the variances, at
-    every noise scale or at the first alone, and two other policies at the bounds.
+    every noise scale or at the first, and two other policies at the bounds.
     """
     scaled = {f"scale {scale}": Lane(scale) for scale in settings["scales"]}
     groups = {

@@ -1,4 +1,4 @@
-"""Runs of the tracking example side by side, and what is recorded of their errors."""
+"""Runs of the tracking example in one batch, and the record of their errors."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -29,9 +29,9 @@ Ask = Callable[[Signals, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
 class Lane(NamedTuple):
-    """A setting in which every episode is run: actual over bound variances, who requests.
+    """A setting of every episode: actual over bound variances, and the requests.
 
-    ``ask`` instead of the trigger's own requests; ``known_start`` puts x(0) at its mean.
+    ``ask`` replaces the trigger's requests; ``known_start`` sets x(0) to its mean.
     """
 
     scale: float = 1.0
@@ -41,7 +41,7 @@ class Lane(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SideBySide(CorrelatedTrackingSystem):
-    """The system with a noise scale for each run, (N,), and runs that begin at the mean, (N,)."""
+    """The system with a noise scale for each run (N,), and runs that begin at the mean (N,)."""
 
     scales: Array
     known_start: NDArray[np.bool_]
@@ -50,7 +50,7 @@ class SideBySide(CorrelatedTrackingSystem):
         return self.scales
 
     def start(self, noise: Array) -> CorrelatedTrackingState:
-        """Return time 0, as in the system itself but for the runs that begin at the mean."""
+        """Return time 0, with x(0) at its mean in some runs."""
         state = super().start(noise)
         truth = np.where(self.known_start, state.mean[0], state.truth)
         return replace(state, truth=truth)
@@ -128,7 +128,7 @@ class ErrorRecord:
         self.stored: dict[str, Array] = {}
 
     def arrays(self) -> dict[str, Array]:
-        """Return all of it by name."""
+        """Return all arrays by name."""
         compared = ("encloses", "encloses_plane", "node_bounded")
         return (
             {
@@ -192,7 +192,7 @@ class ErrorRecord:
             self._most(node_gap=gap)
 
     def _lanes(self, value: NDArray[Any]) -> NDArray[Any]:
-        """(…, L·E) to (L, …, E)."""
+        """Reshape (…, L·E) to (L, …, E)."""
         split = value.reshape(*value.shape[:-1], self.count, self.episodes)
         return np.moveaxis(split, -2, 0)
 
@@ -207,12 +207,12 @@ class ErrorRecord:
 
 
 def _first(covariance: Array) -> NDArray[np.float64]:
-    """(…, n, n, N) to (…, N, n, n)."""
+    """Transpose (…, n, n, N) to (…, N, n, n)."""
     return np.moveaxis(covariance, -1, -3)
 
 
 def _largest(actual: Array, claimed: Array) -> Array:
-    """The largest λ (…, N) with det(P̄ - λ P) = 0: P bounds P̄ where it is at most 1."""
+    """Return the largest λ (…, N) with det(P̄ - λ P) = 0: P bounds P̄ where λ <= 1."""
     factor = np.linalg.inv(np.linalg.cholesky(_first(claimed)))
     whitened = factor @ _first(actual) @ factor.swapaxes(-1, -2)
     even = 0.5 * (whitened + whitened.swapaxes(-1, -2))
@@ -220,7 +220,7 @@ def _largest(actual: Array, claimed: Array) -> Array:
 
 
 def _whitened(error: Array, claimed: Array) -> Array:
-    """L⁻¹ e eᵀ L⁻ᵀ (n, n, N) of errors (n, N), with P = L Lᵀ."""
+    """Return L⁻¹ e eᵀ L⁻ᵀ (n, n, N) of errors (n, N), with P = L Lᵀ."""
     root = np.linalg.cholesky(_first(claimed))
     z = np.linalg.solve(root, error.T[..., None])[..., 0].T
     return z[:, None] * z[None]

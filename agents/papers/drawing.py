@@ -1,4 +1,4 @@
-"""What the figures of several papers share: panels, legends over all axes, and given ticks."""
+"""Common parts of figures: panels, legends over all axes, and fixed ticks."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 
 def stack(figure: Any, count: int, label: str, **style: Any) -> Any:
-    """Return axes (count,) one over another, with one label of their common horizontal axis."""
+    """Return axes (count,) in one column, with one label of their common horizontal axis."""
     axes = np.ravel(figure.subplots(count, 1, sharex=True, **style))
     axes[-1].set_xlabel(label)
     return axes
@@ -40,6 +40,6 @@ def legend_of(figure: Any, handles: Sequence[Any], columns: int, length: float =
 
 
 def set_ticks(axis: Any, values: Sequence[float]) -> None:
-    """Label a logarithmic vertical axis at these values alone."""
+    """Label a logarithmic vertical axis at these values only."""
     axis.set_yticks(values, [f"{value:g}" for value in values])
     axis.minorticks_off()

@@ -57,20 +57,20 @@ _SEARCHED = 4  # packets in a period, up to which all schedules are compared
 
 
 def example(**options: Any) -> Task:
-    """Return the paper's Section 6, with other ``options`` where they are named."""
+    """Return the paper's Section 6, with changed ``options``."""
     return fusion_gym.make_task(MarkovJumpTrackingOptions(**options))
 
 
 def trigger(m: float, literal: bool = False) -> str:
-    """Return the paper's trigger (33) at the threshold m; m = 0 stands for all that is sent.
+    """Return the paper's trigger (33) at the threshold m; m = 0 sends always.
 
-    ``literal`` takes (33) by its word there too.
+    ``literal`` applies (33) at m = 0, too.
     """
     return f"local_variance:m={m!r}" if m or literal else "always"
 
 
 def _lanes(settings: Settings) -> dict[str, str]:
-    """The trigger at every threshold and the other policies, by their labels."""
+    """Return the trigger at every threshold and the other policies, by their labels."""
     lanes = {f"m = {m:g}": trigger(m) for m in settings["m"]}
     return lanes | {policy: policy for policy in settings["policies"]}
 
@@ -79,8 +79,8 @@ class Run(NamedTuple):
     """E episodes of H steps, k = 1..H first.
 
     ``truth`` and ``mean`` (H, n, E), the fused estimate · ``local_error`` (H, l, n, E) · of the
-    first episode, which for a trigger that looks at covariances is every one: ``sent`` (H, l) bool
-    and the ``trace`` (H,) of the fused covariance.
+    first episode, which represents all episodes of a covariance trigger: ``sent`` (H, l) bool and
+    the ``trace`` (H,) of the fused covariance.
     """
 
     truth: Array
@@ -113,7 +113,7 @@ def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
 
 
 def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return schedules and traces of one run, for none depends on the data."""
+    """Return schedules and traces of one run, which do not depend on the data."""
     lanes, options = _lanes(settings), settings["options"]
     task = example(**({"horizon": _LONG} | options))
     short = example(**({"horizon": _SHOWN} | options))
@@ -144,7 +144,7 @@ def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def period_of(values: Array) -> int:
-    """Return the period of values (H,) at their end; 0 if they do not repeat themselves."""
+    """Return the period of values (H,) at their end, or 0."""
     last = values[-_LAST:]
     for period in range(1, _LAST // 3):
         if np.abs(last[period:] - last[:-period]).max() <= _SETTLED * np.abs(last).max():
@@ -217,10 +217,7 @@ def _summarise_tracking(data: Data) -> Data:
 
 
 def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return actual and claimed covariances of nodes and centre; the printed recursion beside ours.
-
-    The first threshold must be 0, where all is sent.
-    """
+    """Return actual and claimed covariances of nodes and centre; the first threshold must be 0."""
     task = example()
     system: Any = task.system
     time = np.arange(1, task.horizon + 1)
@@ -251,7 +248,7 @@ def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def _exact(system: Any, horizon: int) -> Array:
-    """Joint covariances (H + 1, l n, l n) of the nodes' own errors, the library's."""
+    """Return joint covariances (H + 1, l n, l n) of the nodes' errors from the library."""
     joint = system.recursion.local[..., system.filters.at(np.arange(horizon + 1))]
     size = joint.shape[0] * joint.shape[2]
     return np.ascontiguousarray(joint.transpose(4, 0, 2, 1, 3)).reshape(horizon + 1, size, size)
@@ -283,7 +280,7 @@ def _summarise_theorems(data: Data) -> Data:
 
 
 def simulate_others(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return errors of random requests and of the best schedules at the trigger's packets."""
+    """Return errors of random requests and of the best schedules at the trigger's rate."""
     task = example()
     paper, chance, rates, packets, best = [], [], [], [], []
 
@@ -352,7 +349,7 @@ _LANE = 1.7
 
 
 def _draw_instants(figure: Any, data: Data) -> None:
-    """A panel a threshold, without m = 0 unless it stands alone."""
+    """Draw a panel per threshold, without m = 0 unless it is the only one."""
     lanes = list(zip(data["labels"], data["sent"].astype(bool)[:, :_INSTANTS], strict=True))
     lanes = [lane for lane in lanes if lane[0] != "m = 0"] or lanes
     axes = stack(figure, len(lanes), _TIME)
@@ -388,7 +385,7 @@ def _draw_tracking(figure: Any, data: Data) -> None:
 
 
 def _draw_errors(figure: Any, data: Data) -> None:
-    """RMSE over as many runs as in the paper, and over all."""
+    """Draw the RMSE over as many runs as in the paper, and over all."""
     axes = stack(figure, len(STATES), _TIME)
     for state, axis in enumerate(axes):
         _curves(axis, data, data["few"][..., state], width=0.7, alpha=0.55)

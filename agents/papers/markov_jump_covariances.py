@@ -1,7 +1,7 @@
 """The paper's cross-covariances (46)-(50) with its own filters (14)-(22), as printed.
 
-The environment carries the exact joint covariance instead. This stands beside it to say where the
-printed recursion holds.
+The environment has the exact joint covariance instead; the comparison shows the conditions of the
+printed recursion.
 """
 
 from itertools import pairwise
@@ -14,11 +14,11 @@ from fusion_gym.arrays import Array
 
 
 def covariances(system: Any, sent: NDArray[np.bool_], swapped: bool) -> Array:
-    """Return Σ(k) (H + 1, l n, l n) at k = 0..H; ``sent`` (H, l) is what was sent at k = 1..H.
+    """Return Σ(k) (H + 1, l n, l n) at k = 0..H; ``sent`` (H, l) are the transmissions at k = 1..H.
 
-    Its entries are the sums (45) and (51) over the modes.
-    ``swapped`` takes the third term of (46) as it is printed, with the indices i and j of the
-    first; otherwise it is the transposed second term of the pair (j, i), as its derivation wants.
+    Its entries are the sums (45) and (51) over the modes. ``swapped`` uses the third term of (46)
+    as printed, with the indices i and j of the first; otherwise it is the transposed second term of
+    the pair (j, i), which its derivation implies.
     """
     joint, states = np.array(_joint(system, sent, swapped)), system.plant.size
     times, count, _, size, _ = joint.shape
@@ -28,7 +28,7 @@ def covariances(system: Any, sent: NDArray[np.bool_], swapped: bool) -> Array:
 
 
 def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
-    """P_ij (l, l, a, a) of the copies at k = 0..H."""
+    """Return P_ij (l, l, a, a) of the copies at k = 0..H."""
     filters, model = system.filters, system.model
     moved, faded = model.transition, model.faded
     shared = model.sensors.noise_coupling[..., 0] @ model.plant.noise_covariance  # S_wv
@@ -50,7 +50,7 @@ def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
         filtered, crossed, noises = np.empty_like(filtered), np.zeros_like(crossed), noises.copy()
         for i in range(count):
             for j in range(count):
-                cross, second, white = (of[i, j] for of in old)
+                cross, second, white = (from_sample[i, j] for from_sample in old)
                 third = cross.T if swapped and i != j else old[0][j, i].T
                 ahead = (
                     moved @ second @ moved.T + moved @ cross @ entry.T + entry @ third @ moved.T
@@ -86,7 +86,7 @@ def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
 
 
 def _prior(system: Any, place: int, node: int) -> Array:
-    """P_i(k|k-1), from (19): P(k|k) = (I - K c) P(k|k-1); without a sample they are the same."""
+    """Return P_i(k|k-1) from (19): P(k|k) = (I - K c) P(k|k-1), equal without a sample."""
     filters = system.filters
     keep = np.eye(system.model.size) - np.outer(
         filters.gain[node, :, place], system.model.faded[node]

@@ -1,4 +1,4 @@
-"""Numbers of a reproduction beside printed ones, verdicts from data, and their text."""
+"""Numbers of a reproduction with the printed ones, verdicts from data, and their text."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Verdict = Literal["holds", "holds partly", "does not hold"]
 
 
 class Number(NamedTuple):
-    """A number of ours, beside the printed one where there is one.
+    """A reproduced number, with the printed one if there is one.
 
     ``low`` and ``high`` are the 95 % interval of ``mean``. ``spread`` is the standard deviation of
-    what the paper prints, for its own number of runs: a single run's where it shows one.
+    the printed number over the paper's number of runs: a single run's if it shows one.
     """
 
     what: str
@@ -29,7 +29,7 @@ class Number(NamedTuple):
     unit: str = ""
 
     @classmethod
-    def of(
+    def from_sample(
         cls, what: str, sample: Any, printed: float | None = None, runs: int = 1, unit: str = ""
     ) -> Number:
         """Return the number of a sample (episodes,); the paper prints its mean over ``runs``."""
@@ -40,7 +40,7 @@ class Number(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Whether the printed number lies where 95 % of such runs would, ours being uncertain."""
+        """Whether the printed number lies where 95 % of such runs would, given our uncertainty."""
         if self.printed is None:
             return "not printed"
         allowed = math.hypot(1.96 * self.spread, 0.5 * (self.high - self.low))
@@ -48,7 +48,7 @@ class Number(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The number with its interval; without where it depends on no draw."""
+        """The number with its interval, if it depends on random draws."""
         exact = self.low == self.mean == self.high
         interval = "" if exact else f" [{self.low:.4g}, {self.high:.4g}]"
         return f"{self.mean:.4g}{interval} {self.unit}".strip()
@@ -60,9 +60,9 @@ class Number(NamedTuple):
 
 
 def grid(columns: Sequence[str], rows: Mapping[str, Iterable[Any]]) -> list[Number]:
-    """Return a number for each sample of each row, which is called "row: column"."""
+    """Return a number named "row: column" for each sample of each row."""
     return [
-        Number.of(f"{row}: {column}", sample)
+        Number.from_sample(f"{row}: {column}", sample)
         for row, samples in rows.items()
         for column, sample in zip(columns, samples, strict=True)
     ]
@@ -90,15 +90,15 @@ def estimate(sample: Any) -> Interval:
 def below(first: Any, second: Any) -> Any:
     """Return whether paired samples (…, episodes) show the first mean below the second.
 
-    The whole interval of the difference must lie below zero.
+    The whole interval of the difference must be below zero.
     """
     return estimate(np.asarray(first) - np.asarray(second)).high < 0.0
 
 
 def cite(value: Any, digits: int = 3) -> str:
-    """Write an interval as mean [low, high], with as many significant digits.
+    """Write an interval as mean [low, high] with significant digits.
 
-    A sample (episodes,) stands for its mean and interval; several are separated by commas.
+    A sample (episodes,) represents its mean and interval; commas separate several.
     """
     if isinstance(value, list | tuple | np.ndarray) and not isinstance(value, Interval):
         if isinstance(value, list | tuple) or value.ndim > 1:
@@ -109,7 +109,7 @@ def cite(value: Any, digits: int = 3) -> str:
 
 
 def percent(share: Any) -> str:
-    """Write a share between 0 and 1 in per cent, neither 0 nor 100 unless it is; or several."""
+    """Write a share in per cent, rounded to 0 or 100 only if exact; or several shares."""
     if isinstance(share, list | tuple | np.ndarray):
         return ", ".join(percent(float(item)) for item in share)
     for digits in range(7):

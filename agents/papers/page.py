@@ -68,7 +68,7 @@ def write_page(paper: Paper, results: Mapping[str, Data], counts: Counts, output
 
 
 def write_overview(output: Path) -> None:
-    """Write the page over all papers whose numbers are there."""
+    """Write the page over all papers with stored numbers."""
     paths = [output / f"{name}.json" for name in NAMES]
     papers = [read_json(path, "numbers") for path in paths if path.exists()]
     for paper in papers:
@@ -126,9 +126,9 @@ def write_figure(figure: PaperFigure, data: Data, path: Path) -> None:
 
 
 def _fewer_colours(png: Path) -> None:
-    """Reduce the file to a fourth of its size: drawings have few colours and their mixtures.
+    """Reduce the file to a fourth of its size by a palette.
 
-    Maximum coverage keeps a thin line's colour, which a median cut gives up for more frequent ones.
+    Maximum coverage keeps a thin line's colour, unlike a median cut.
     """
     with Image.open(png) as picture:
         full = picture.convert("RGB")

@@ -28,9 +28,9 @@ class Piece(NamedTuple):
     """A part of a simulation section.
 
     ``simulate(episodes, seed, settings)`` returns numbers, texts, lists and arrays by name; the
-    restriction of a figure is added as keywords. ``summarise`` takes them and returns what the page
-    inserts beside them, its ``tables`` as lists of numbers by name. ``weight`` is about how many
-    seconds of one core ``usual`` episodes take.
+    restriction of a figure adds keywords. ``summarise`` takes them and returns additional entries
+    of the page, its ``tables`` as lists of numbers by name. ``weight`` is about the seconds of one
+    core for ``usual`` episodes.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Piece(NamedTuple):
 
 
 class PieceJob(NamedTuple):
-    """A piece with episodes, seed, settings, and the keywords of a figure that shows a part."""
+    """A piece with episodes, seed, settings, and a figure's keywords."""
 
     piece: Piece
     episodes: int
@@ -51,30 +51,30 @@ class PieceJob(NamedTuple):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Episodes and seed by name."""
+        """Return episodes and seed by name."""
         return {"episodes": self.episodes, "seed": self.seed}
 
     @property
     def key(self) -> tuple[Callable[..., Data], Data]:
-        """The function, and all that the data depend on beside the code."""
+        """Return the function and all inputs of the data."""
         inputs = self.counts | {"settings": self.settings, "restriction": self.restriction}
         return self.piece.simulate, inputs
 
     @property
     def weight(self) -> float:
-        """About how many seconds of one core it takes."""
+        """About the seconds of one core."""
         return self.piece.weight * self.episodes / self.piece.usual
 
     def simulate(self, cache: Cache) -> Data:
-        """Return the data of the piece, from the cache or simulated now."""
+        """Return the data of the piece, from the cache or simulated."""
         return cache.call(*self.key, self.episodes, self.seed, self.settings, **self.restriction)
 
 
 class PaperFigure(NamedTuple):
     """A figure: ``draw(figure, data)`` draws the data of a piece into an empty matplotlib Figure.
 
-    ``size`` is in inches. ``restriction`` has the keywords of ``simulate`` that leave out what the
-    figure does not show, ``without`` the paper's parameters that do not change it.
+    ``size`` is in inches. ``restriction`` has the keywords of ``simulate`` that omit unused data,
+    ``without`` the paper's parameters without effect.
     """
 
     piece: str
@@ -85,14 +85,14 @@ class PaperFigure(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """What a figure may change: ``check(name, value)`` returns the value or refuses it."""
+    """A parameter of figures: ``check(name, value)`` returns the value or refuses it."""
 
     default: Any
     check: Callable[[str, Any], Any]
 
 
 class Paper(NamedTuple):
-    """A paper: its pieces in the order of its page, its figures by name, and what may be set.
+    """A paper: its pieces in the order of its page, its figures by name, and its parameters.
 
     ``options`` names the options of ``environment`` that a figure may change as well.
     """
@@ -105,13 +105,7 @@ class Paper(NamedTuple):
     options: Sequence[str] = ()
 
     def settings(self, changes: Settings, without: Sequence[str] = ()) -> Data:
-        """Return the parameters with these changes, and the changed options as ``options``.
-
-        Those named in ``without`` cannot be changed.
-
-        Raises:
-            ConfigurationError: an unknown name, or a value that is not allowed.
-        """
+        """Return the changed parameters, and changed options as ``options``, except ``without``."""
         known = [name for name in (*self.parameters, *self.options) if name not in without]
         keys("option", changes, known)
         settings = {
@@ -125,11 +119,7 @@ class Paper(NamedTuple):
         return settings | {"options": options}
 
     def figure(self, name: str) -> tuple[str, PaperFigure]:
-        """Return a figure with its full name, also for its number alone.
-
-        Raises:
-            ConfigurationError: there is no such figure.
-        """
+        """Return a figure with its full name, by its name or number."""
         full = name if name in self.figures else f"figure_{name}"
         if full not in self.figures:
             choice("figure", name, [known.removeprefix("figure_") for known in self.figures])
@@ -141,22 +131,14 @@ class Paper(NamedTuple):
 
 
 def load_paper(name: str) -> Paper:
-    """Return a paper from its module.
-
-    Raises:
-        ConfigurationError: there is no such paper.
-    """
+    """Return a paper from its module."""
     module = importlib.import_module(f"agents.papers.{choice('paper', name, NAMES)}")
     paper: Paper = module.PAPER
     return paper
 
 
 def load_papers(names: Sequence[str]) -> list[Paper]:
-    """Return some papers, each once; ``all`` stands for all of them.
-
-    Raises:
-        ConfigurationError: no name, or an unknown one.
-    """
+    """Return some papers, each once; ``all`` stands for all of them."""
     if not names:
         raise ConfigurationError(f"papers = () is not allowed: name some of {[*NAMES, 'all']}")
     for name in names:
@@ -180,7 +162,7 @@ def numbers_within(**limits: float) -> Callable[[str, Any], tuple[float, ...]]:
 
 
 def policy_of(rule: str = "NAME") -> Callable[[str, Any], str]:
-    """Return a check for a policy with parameters, of this rule where one is named."""
+    """Return a check for a policy with parameters, optionally of one rule."""
 
     def check(name: str, value: Any) -> str:
         if not isinstance(value, str) or rule not in ("NAME", value.partition(":")[0]):
@@ -191,11 +173,7 @@ def policy_of(rule: str = "NAME") -> Callable[[str, Any], str]:
 
 
 def policy_list(name: str, value: Any) -> tuple[str, ...]:
-    """Check one policy, or a list of them.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Check one policy, or a list of them."""
     entries = (value,) if isinstance(value, str) else tuple(np.atleast_1d(value).tolist())
     if not all(isinstance(entry, str) for entry in entries):
         raise refusal(name, value, "a policy, or a list of them")

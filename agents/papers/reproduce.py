@@ -71,11 +71,7 @@ class Reproduce(Command):
     """Processes side by side."""
 
     def run(self) -> None:
-        """Simulate what is not there, then write every page, or the figure.
-
-        Raises:
-            ConfigurationError: no paper, an unknown name, or a parameter that is not allowed.
-        """
+        """Simulate missing pieces, then write every page, or the figure."""
         papers = load_papers(self.papers)
         changes = parse_settings("option", itertools.chain(*self.options))
         if self.figure is not None:
@@ -123,7 +119,7 @@ class Reproduce(Command):
         return PieceJob(piece, self.episodes or piece.usual, self.seed, settings, dict(restriction))
 
     def _simulate(self, jobs: Sequence[PieceJob]) -> list[Data]:
-        """Return the data of all jobs, from the work folder or simulated now."""
+        """Return the data of all jobs, from the work folder or simulated."""
         cache = Cache(self.work)
         if not self.resume:
             for job in jobs:
@@ -134,7 +130,7 @@ class Reproduce(Command):
         return [cache.read(*job.key) for job in jobs]
 
     def interrupted(self) -> str:
-        """Finished simulations are kept."""
+        """Return the message of an interruption, with the command that continues."""
         words = [word for word in sys.argv[1:] if word != "--resume"]
         command = f"{self.program} {shlex.join([*words, '--resume'])}"
         return f"interrupted; go on with: {command}"
@@ -150,7 +146,7 @@ def reproduce_figure(
         figure: The figure's number or name.
         episodes: Episodes of the simulation, instead of the paper's own number.
         seed: Seed of the first episode.
-        changes: Parameters of the paper, or options of its environment.
+        **changes: Parameters of the paper, or options of its environment.
 
     Raises:
         ConfigurationError: an unknown name, or a value that is not allowed.

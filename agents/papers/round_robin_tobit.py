@@ -68,7 +68,7 @@ def _oscillator(settings: Settings, **options: Any) -> Task:
 
 
 def simulate_oscillator(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return one run, what its estimators hold by (4), and the RMSE of both filters."""
+    """Return one run, the estimators' values by (4), and the RMSE of both filters."""
     tasks = {name: _oscillator(settings, **options) for name, options in _BOTH.items()}
     result = _curves(tasks, episodes, seed, settings)
     for name, task in tasks.items():
@@ -232,7 +232,7 @@ def _median(values: Array) -> dict[str, list[float]]:
 
 
 def _rise(before: Array, after: Array) -> dict[str, Any]:
-    """From one row to the next, of ARMSE1, 2, 3 and the median: ends of the paired intervals."""
+    """Return the paired intervals of ARMSE1, 2, 3 and the median from one row to the next."""
     result = runs.increase(before, after)
     middle = np.quantile(runs.medians(after)[1] - runs.medians(before)[1], [0.025, 0.975])
     return {end: [*result[end], float(middle[i])] for i, end in enumerate(("low", "high"))}
@@ -276,7 +276,7 @@ def _summarise_tables(data: Data) -> Data:
 
 
 def _broken(data: Data, printed: dict[str, Any]) -> Data:
-    """How many printed values no filter can have."""
+    """Return how many printed values lie below every filter's bound."""
     entries = [
         (value, row["floor"][i], row["floor_all"][i])
         for name, start in (("table_2", 0), ("table_3", 1))
@@ -300,7 +300,7 @@ def _broken(data: Data, printed: dict[str, Any]) -> Data:
 
 
 def _moves(rows: list[Data], end: str, sign: float) -> Data:
-    """Which errors move from row to row as claimed by more than chance: ARMSE and the median."""
+    """Return which errors change from row to row as claimed: ARMSE and the median."""
     moved = {
         name: np.array([sign * np.array(row[name]["rise"][end]) for row in rows[1:]]).min(0) > 0
         for name in _FILTERS
@@ -364,7 +364,7 @@ _STYLES: dict[str, tuple[str, str, str, float]] = {
 
 
 def _curve(data: Data, kind: str, name: str, state: int) -> Array:
-    """A curve (1, H), or (3, H) with the ends of its interval."""
+    """Return a curve (1, H), or (3, H) with the ends of its interval."""
     if name == "least":
         return np.full((1, data["aware_rmse"].shape[1]), data["bias_deviation"])
     values: Array = np.atleast_2d(data[name if name == "truth" else f"{name}_{kind}"][..., state])
@@ -379,7 +379,7 @@ def _draw_curves(
     names: Sequence[str],
     step: str = _STEP,
 ) -> None:
-    """Panels one over another over a common time, each with the name of its axis and a state."""
+    """Draw panels in a column over a common time, each with its axis label and a state."""
     axes = stack(figure, len(panels), step)
     for axis, (label, state) in zip(axes, panels, strict=True):
         for name in names:
@@ -416,7 +416,7 @@ def _draw_measurements(figure: Any, data: Data) -> None:
 
 
 def _draw_table(figure: Any, data: Data, name: str) -> None:
-    """Printed values, ours, and what no filter can be below."""
+    """Draw printed values, ours, and the lower bound of every filter."""
     rows, places = data[name], np.arange(len(data[name]))
     printed = {(5.0, v): values for v, values in TABLE_III.items()} | {
         (limit, 0.6): values for limit, values in TABLE_II.items()

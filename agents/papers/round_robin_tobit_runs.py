@@ -29,7 +29,7 @@ FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
 
 
 def censored(task: Task) -> CensoredSystem:
-    """Return the task's system, known for what it is."""
+    """Return the task's system with its type."""
     assert isinstance(task.system, CensoredSystem)
     return task.system
 
@@ -54,7 +54,7 @@ def node_squares(task: Task, policy: Policy | str, episodes: int, seed: int) -> 
 
 
 def held_values(task: Task, policy: str, seed: int) -> Array:
-    """Return what the estimators hold (H, sensors) in the first run, by equation (4)."""
+    """Return the estimators' values (H, sensors) in the first run, by equation (4)."""
     rows: list[Array] = []
     for batch, requests in walk(task, policy, 1, seed):
         batch.step(requests)
@@ -71,10 +71,10 @@ def resampled(episodes: int, seed: int = 0) -> Array:
 
 
 def armse(squared: Array) -> dict[str, list[float]]:
-    """Return the paper's ARMSE a state: mean over time of the root of the mean over runs.
+    """Return the paper's ARMSE per state: mean over time of the root of the mean over runs.
 
     ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval over episodes, and ``spread``, the
-    standard deviation of what so many runs as the paper's would give.
+    standard deviation over as many runs as the paper's.
     """
     drawn = _drawn(squared)
     spread = drawn.std(0) * np.sqrt(len(squared) / PAPER_RUNS)
@@ -82,7 +82,7 @@ def armse(squared: Array) -> dict[str, list[float]]:
 
 
 def increase(before: Array, after: Array) -> dict[str, list[float]]:
-    """Return how far :func:`armse` rises a state, from one filter to another on the same seeds.
+    """Return the increase of :func:`armse` per state between two filters on the same seeds.
 
     ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval of the paired difference.
     """
@@ -113,7 +113,7 @@ def _drawn(squared: Array) -> Array:
 def armse_number(
     what: str, lists: dict[str, list[float]], state: int, printed: float | None, unit: str = ""
 ) -> Number:
-    """Return one entry of :func:`armse` beside the printed one."""
+    """Return one entry of :func:`armse` with the printed one."""
     mean, low, high, spread = (lists[key][state] for key in ("mean", "low", "high", "spread"))
     return Number(what, mean, low, high, printed, spread, unit)
 
@@ -132,10 +132,11 @@ def paired_increase(ours: Array, others: Array) -> Array:
 
 
 def floor(env: str, **options: Any) -> list[float]:
-    """Return ARMSE that no filter beats: Kalman's, on the same packets without censoring.
+    """Return the ARMSE of the Kalman filter on the same packets without censoring, a lower bound.
 
-    The system without censoring is linear and Gaussian, so its covariances are the least there
-    are, and a clipped packet says no more than the whole one. They follow from the matrices alone.
+    The system without censoring is linear and Gaussian, so its covariances are the least possible,
+    and a clipped packet carries no more information than the whole one. They follow from the
+    matrices.
     """
     task = fusion_gym.make_task(env, filter="kalman", **(FREE | options))
     policy = "always" if task.access == "any" else "round_robin"
@@ -148,7 +149,7 @@ def floor(env: str, **options: Any) -> list[float]:
 
 
 class Comparison(NamedTuple):
-    """Of how many points one curve is clearly lower, clearly higher, or lower by the mean."""
+    """At how many points one curve is clearly lower, clearly higher, or lower by the mean."""
 
     verdict: Verdict
     lower: int
@@ -158,11 +159,11 @@ class Comparison(NamedTuple):
 
 
 def always_below(difference: Array) -> Comparison:
-    """Return whether one curve lies below another at every step, and how often it does.
+    """Return whether one curve lies below another at every step, and at how many points.
 
     ``difference`` (2, H, …) is the mean of the paired differences of squared errors with its
     standard error. It holds if no point has the other order by more than chance and more than half
-    of them have this one clearly; partly if more have this one clearly than the other.
+    are clearly lower; partly if more points are clearly lower than higher.
     """
     mean, error = difference
     lower = (mean < -_CLEAR * error) & (error > 0)
@@ -176,12 +177,11 @@ def always_below(difference: Array) -> Comparison:
 
 @dataclass(frozen=True)
 class PrintedTobitFilter(TobitKalmanFilter):
-    """The Tobit Kalman filter with one of the paper's equations as it stands there.
+    """The Tobit Kalman filter with one of the paper's equations as printed.
 
-    ``printed``: ``"theta"`` divides by R instead of √R in the ϑ below (11); ``"sign"`` adds
-    √R λ(ϑʳ, ϑˡ) in (23) instead of subtracting it; ``"argument"`` adds √R λ(ϑʳ - ϑˡ) there, with
-    the λ of one argument of Theorem 4; ``"variance"`` takes (13) at its word, as the variance of
-    the censored value.
+    ``printed``: ``"theta"`` divides by R instead of √R in the ϑ below (11); ``"sign"`` adds √R
+    λ(ϑʳ, ϑˡ) in (23) instead of subtracting it; ``"argument"`` adds √R λ(ϑʳ - ϑˡ) there, with the λ
+    of one argument of Theorem 4; ``"variance"`` uses (13) as the variance of the censored value.
     """
 
     printed: str = "sign"

@@ -1,4 +1,4 @@
-"""Lemma 1, the theorems and the remarks of round_robin_tobit, held to simulated episodes."""
+"""Lemma 1, the theorems and the remarks of round_robin_tobit in simulated episodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -55,7 +55,7 @@ SHARE = 0.5  # ε of a node, the paper's 1/p
 
 
 def simulate_theory(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return what the claims of Lemma 1, Theorems 1 and 2 and the remarks are judged by."""
+    """Return the data for the claims of Lemma 1, Theorems 1 and 2 and the remarks."""
     return {
         **_lemma(episodes, seed),
         **{
@@ -125,7 +125,7 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
 
 
 def _fusion(episodes: int, seed: int) -> dict[str, Any]:
-    """How far the fused estimate moves with the shares ε, and with B = 0 with the bias."""
+    """Return the change of the fused estimate with the shares ε, and with B = 0 with the bias."""
     split = [fusion_gym.make_task(OSCILLATOR, information_shares=[*each]) for each in SHARES]
     means = [_means(task, episodes, seed) for task in split]
     no_bias: dict[str, Any] = {"access": "any", "bias_gain": [[0.0], [0.0]]}
@@ -146,7 +146,7 @@ def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> 
 
 
 def _worth(episodes: int, seed: int) -> dict[str, Any]:
-    """Squared errors (episodes,), summed over states, of other filters on the same measurements."""
+    """Return squared errors (episodes,), summed over states, of other filters on the same data."""
     settings: dict[str, dict[str, Any]] = {
         "paper": {}, "adf": {"filter": "adf"}, "kalman": {"filter": "kalman"},
         "free": {"filter": "kalman"} | FREE, "calm": {"bias_noise_covariance": [[0.0025]]},
@@ -164,7 +164,7 @@ def _worth(episodes: int, seed: int) -> dict[str, Any]:
 
 
 class Censoring(NamedTuple):
-    """What a sensor's filter expects, (N,): α, 1 - α - β, and φ of Theorem 4 without its sign."""
+    """A sensor's prediction, (N,): α, 1 - α - β, and φ of Theorem 4 without its sign."""
 
     left: Array
     inside: Array
@@ -173,7 +173,7 @@ class Censoring(NamedTuple):
 
 @dataclass
 class MatrixBound:
-    """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
+    """A bound (states, states, N) of a sensor's covariance P⁻.
 
     P^u or P^l of Theorem 4, in a ``reading`` of :data:`UPPER` or :data:`LOWER`. ``inflation`` is 1
     for a single filter and ε⁻¹ for a node, whose process covariance is Q/ε by (27).
@@ -187,7 +187,7 @@ class MatrixBound:
     value: Array = field(default_factory=lambda: np.zeros(0), init=False)
 
     def begin(self, covariance: Array) -> None:
-        """At the first step: P^u = P⁻ and P^l = 0, as the proof has it."""
+        """Start the bound as the proof does: P^u = P⁻ and P^l = 0."""
         self.value = covariance.copy() if self.upper else np.zeros_like(covariance)
 
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
@@ -196,7 +196,7 @@ class MatrixBound:
         return matrix_below(least, most)
 
     def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
-        """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
+        """Move to the next step, given P⁻, the prediction, and whether this sensor has its turn."""
         system = censored(self.task)
         stored, share = (self._updated_upper if self.upper else self._updated_lower)(
             covariance, observed, turn
@@ -232,7 +232,7 @@ def failures(
     """Return shares of an episode's steps in which a bound fails.
 
     Of Theorem 4, (bounds, episodes); of Theorem 5, (pairs, episodes), for pairs of bounds of both
-    sensors in the order in which they stand.
+    sensors in their order.
     """
     pairs = [bounds[i : i + 2] for i in range(0, len(bounds) - 1, 2)]
     local, fused = np.zeros((len(bounds), episodes)), np.zeros((len(pairs), episodes))
@@ -257,7 +257,7 @@ def failures(
 
 
 def _of(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]:
-    """Both bounds of a sensor in all their readings."""
+    """Return both bounds of a sensor in all their readings."""
     return {
         f"{end}/{name}": MatrixBound(task, sensor, inflation, end == "upper", reading)
         for end, readings in (("upper", UPPER), ("lower", LOWER))
@@ -275,14 +275,14 @@ def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
 
 
 def matrix_below(first: Array, second: Array) -> NDArray[np.bool_]:
-    """Return whether (N,) ``first`` ≤ ``second`` (n, n, N) but for rounding; NaN bounds nothing."""
+    """Return whether (N,) ``first`` ≤ ``second`` (n, n, N) up to rounding; false for NaN."""
     scale = np.maximum(linalg.trace(np.abs(first)), linalg.trace(np.abs(second)))
     gap = linalg.add_diagonal(second - first, np.broadcast_to(1e-9 * scale, second.shape[1:]))
     return np.asarray(np.isfinite(linalg.cholesky(gap)).all((0, 1)))
 
 
 def _joined(parts: list[Array]) -> Array:
-    """(Σ P_m⁻¹)⁻¹ of x, as Theorem 5 joins the bounds; NaN where one is indefinite."""
+    """Return (Σ P_m⁻¹)⁻¹ of x, as Theorem 5 joins the bounds; NaN for an indefinite bound."""
     return linalg.inverse(sum((linalg.inverse(part) for part in parts), np.zeros(1)))[:2, :2]
 
 
@@ -325,8 +325,9 @@ def summarise_theory(data: Data) -> Data:
         error = np.maximum(data[f"{value}_error"], 1e-12)
         off[name] = int((np.abs(data[value] - data[against]) > _CLEAR * error).sum())
     own, free, calm = (np.array(data[f"armse_{name}"]) for name in ("paper", "free", "calm"))
+    theory = [Number.from_sample(what, data[name]) for what, name in numbers.items()]
     return {
-        "tables": {"theory": [Number.of(what, data[name]) for what, name in numbers.items()]},
+        "tables": {"theory": theory},
         "places": PLACES, "off": off,
         "worst": int(np.argmax(np.abs(data["mean"] - data["equation_12_printed"]))),
         "most": int(np.argmax(np.abs(data["variance"] - data["equation_13"]))),
@@ -349,7 +350,7 @@ def _correlation(data: Data) -> Data:
 
 
 def summarise_bounds(data: Data) -> Data:
-    """Return how often the bounds of Theorems 4 and 5 fail, by reading."""
+    """Return the failure rates of the bounds of Theorems 4 and 5, by reading."""
     rows = {}
     for name in (key.partition(":")[2] for key in data if key.startswith("oscillator:")):
         theorem, end, reading, *sensor = name.split("/")
@@ -359,7 +360,7 @@ def summarise_bounds(data: Data) -> Data:
         "examples": list(EXAMPLES),
         "tables": {
             "bounds": [
-                Number.of(f"{row}: {example}", 100 * data[f"{example}:{name}"], unit="%")
+                Number.from_sample(f"{row}: {example}", 100 * data[f"{example}:{name}"], unit="%")
                 for row, name in rows.items()
                 for example in EXAMPLES
             ]

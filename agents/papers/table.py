@@ -2,7 +2,7 @@
 
     python -m agents.papers.table --config configs/tobit_oscillator_reproduce.yaml
 
-Every row runs on the same seeds. ``--markdown`` prints the table as the documentation holds it.
+Every row runs on the same seeds. ``--markdown`` prints Markdown.
 """
 
 from dataclasses import dataclass
@@ -51,11 +51,7 @@ class Table(Long):
 
 
 def _rows_of(comparison: SweepSettings, episodes: int, seed: int) -> list[tuple[str, ...]]:
-    """One row of text for each of the config's rows.
-
-    Raises:
-        ConfigurationError: a row that is not allowed, before the first episode.
-    """
+    """Return one row of text for each of the config's rows."""
     result = []
     for row in comparison.rows:
         task = make_task(row.environment or comparison.environment, **row.options)

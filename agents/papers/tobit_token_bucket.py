@@ -99,7 +99,7 @@ def _summarise_network(data: Data) -> Data:
 def simulate_estimates(
     episodes: int, seed: int, settings: Settings, singles: Sequence[int] = _NODES
 ) -> Data:
-    """Return states, local and fused estimates, and how far they fluctuate from step to step.
+    """Return states, local and fused estimates, and their changes from step to step.
 
     ``singles`` are the sensors whose filters also run without the others.
     """
@@ -123,7 +123,7 @@ def simulate_estimates(
 
 
 def _mean_where(values: Any, selection: Any) -> Any:
-    """Mean of values (H, E) by episode where ``selection``; not a number where nothing is."""
+    """Return the mean of values (H, E) by episode over ``selection``, or NaN."""
     with np.errstate(invalid="ignore"):
         return (values * selection).sum(0) / selection.sum(0)
 
@@ -294,7 +294,7 @@ def _draw_tokens(figure: Any, data: Data) -> None:
 
 
 def _draw_measurements(figure: Any, data: Data, component: int) -> None:
-    """A panel a node."""
+    """Draw a panel per node."""
     measured, held = (data[name][..., component] for name in ("measured", "held"))
     axes = stack(figure, SENSORS, _TIME, sharey=True)
     time = np.arange(1, len(measured) + 1)
@@ -312,7 +312,7 @@ def _draw_measurements(figure: Any, data: Data, component: int) -> None:
 
 
 def _draw_states(figure: Any, data: Data, sensor: int) -> None:
-    """A panel a state."""
+    """Draw a panel per state."""
     truth, local, fused = data["truth"], data["local"][:, sensor], data["fused"]
     axes = stack(figure, truth.shape[1], _TIME)
     time = np.arange(1, len(truth) + 1)
@@ -334,7 +334,7 @@ def _draw_states(figure: Any, data: Data, sensor: int) -> None:
 
 
 def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
-    """The logarithm of squared errors and of the traces of the bounds, of a run and the mean."""
+    """Draw the logarithm of squared errors and of the bounds' traces, of a run and the mean."""
     axes = stack(figure, 2, _TIME)
     own, dashes = COLOURS[sensor], (0, (2.5, 0.8))
     kinds = (("one", "one episode"), ("mean", "mean over all episodes"))

@@ -23,11 +23,11 @@ _FLOOR = 1e-140  # of q where it divides and the ratio is squared
 class History(NamedTuple):
     """E episodes of H steps; t = 1..H first, episodes last.
 
-    ``truth`` (H, n, E) · ``measurement`` (H, l, m, E), censored · ``held`` (H, l, m, E), what the
-    filters have of it after the step, and ``held_before`` · ``requested``, ``granted`` (H, l, E) ·
+    ``truth`` (H, n, E) · ``measurement`` (H, l, m, E), censored · ``held`` (H, l, m, E), the
+    filters' value after the step, and ``held_before`` · ``requested``, ``granted`` (H, l, E) ·
     ``tokens`` (H, E) after the step, ``tokens_before`` · ``prior_mean`` (H, n, E) and
-    ``prior_covariance`` (H, n, n, E) of the centre · ``uncensored`` and ``hazard`` (H, l, m, E),
-    q and λ of the prediction · ``local_mean`` (H, l, n, E), ``local_bound`` (H, l, n, n, E) of the
+    ``prior_covariance`` (H, n, n, E) of the centre · ``uncensored`` and ``hazard`` (H, l, m, E), q
+    and λ of the prediction · ``local_mean`` (H, l, n, E), ``local_bound`` (H, l, n, n, E) of the
     nodes before the feedback · ``mean`` (H, n, E), ``bound`` (H, n, n, E) fused.
     """
 
@@ -70,7 +70,7 @@ class History(NamedTuple):
 
 
 def scheme(**options: Any) -> Task:
-    """Return the paper's example with other ``options`` where they are named."""
+    """Return the paper's example with changed ``options``."""
     return fusion_gym.make_task(TobitOscillatorOptions(**options))
 
 
@@ -87,7 +87,7 @@ def single_sensor(sensor: int) -> Task:
 
 
 def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = TRIGGER) -> History:
-    """Run the paper's trigger, or another policy, and keep everything."""
+    """Run the paper's trigger, or another policy, and record every step."""
     system: Any = task.system
     rows, share = [], system.centre.feedback.share[:, None, None]
     for batch, requests in walk(task, policy, episodes, seed):
@@ -111,11 +111,11 @@ def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = 
 
 
 class Terms(NamedTuple):
-    """(30) of a node and step as κ₁ (I - K q C) P (I - K q C)ᵀ + K S Kᵀ, in units of q.
+    """Equation (30) of a node and step as κ₁ (I - K q C) P (I - K q C)ᵀ + K S Kᵀ, in units of q.
 
     ``prior`` P (…, n, n) · ``matrix`` C (…, m, n) · ``probability`` q (…, m) · ``noise`` q⁻¹ S q⁻¹
-    without the held value's square and ``pinned`` √κ₅ ȳ/q, zero where something arrived ·
-    ``silent`` where nothing did. Axes: steps, nodes, episodes first.
+    without the held value's square and ``pinned`` √κ₅ ȳ/q, zero after a delivery · ``silent``
+    without a delivery. Axes: steps, nodes, episodes first.
     """
 
     first: float
@@ -128,7 +128,7 @@ class Terms(NamedTuple):
 
     @property
     def gain(self) -> Array:
-        """K q by (37), without loss where ȳ/q is huge (Sherman and Morrison)."""
+        """Return K q by (37), without loss where ȳ/q is huge (Sherman and Morrison)."""
         cross = self.first * self.prior @ _transposed(self.matrix)
         inverse = np.linalg.inv(self.matrix @ cross + self.noise)
         turned = inverse @ self.pinned[..., None]
@@ -136,7 +136,7 @@ class Terms(NamedTuple):
         return cross @ (inverse - turned / size @ _transposed(turned))
 
     def bound(self, gain: Array) -> Array:
-        """Return trace of (30) for any K q."""
+        """Return the trace of (30) for any K q."""
         keep = np.eye(self.prior.shape[-1]) - gain @ self.matrix
         pinned = gain @ self.pinned[..., None]
         return _trace(
@@ -147,7 +147,7 @@ class Terms(NamedTuple):
 
     @property
     def contraction(self) -> Array:
-        """κ₁ w a² of (42), a the largest singular value of a rotation, which is 1."""
+        """Return κ₁ w a² of (42), a the largest singular value of a rotation, which is 1."""
         keep = np.eye(self.prior.shape[-1]) - self.gain @ self.matrix
         return self.first * np.linalg.norm(keep, ord=2, axis=(-2, -1)) ** 2
 
@@ -185,7 +185,7 @@ def terms(task: Task, history: History) -> Terms:
 
 
 def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
-    """Return Theorem 2 by trial: other gains, and the library's bound beside (30).
+    """Return a test of Theorem 2: other gains, and the library's bound against (30).
 
     Per episode (E,), over its steps with q of at least 0.01: ``larger``, the share of gains K + ΔK
     whose bound has the larger trace, ΔK random and of relative size 10⁻³ to 1; ``difference``, the
@@ -211,7 +211,7 @@ def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
 
 
 def conditioned(value: Terms) -> dict[str, Array]:
-    """Return condition (42) by episode (E,): the share of steps in which it holds, of each kind."""
+    """Return the share of steps (E,) in which condition (42) holds, of each kind."""
     holds = value.contraction < 1.0
     silent = value.silent
     return {
@@ -222,9 +222,9 @@ def conditioned(value: Terms) -> dict[str, Array]:
 
 
 def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
-    """Return largest eigenvalue (H,) of E[z zᵀ], z = P^(-1/2) e, and its standard error.
+    """Return the largest eigenvalue (H,) of E[z zᵀ], z = P^(-1/2) e, and its standard error.
 
-    At most 1 if the bound holds on average. ``error`` (H, n, E), ``bound`` (H, n, n, E).
+    It is at most 1 if the bound holds on average. ``error`` (H, n, E), ``bound`` (H, n, n, E).
     """
     root = np.moveaxis(linalg.root(bound), -1, 1)
     turned = np.moveaxis(error, 1, -1)[..., None]

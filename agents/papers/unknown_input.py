@@ -75,7 +75,7 @@ def make_example(**options: Any) -> tuple[Task, UnknownInputSystem]:
 
 
 def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
-    """Run a policy and record what the figures show."""
+    """Run a policy and record the data of the figures."""
     rows = []
     for batch, requests in walk(task, policy, episodes, seed):
         apart = batch.state.measurement - batch.state.held
@@ -93,10 +93,10 @@ def halves(value: Array, states: int, axis: int) -> Array:
 
 
 def leading(errors: Array, bounds: Array) -> Array:
-    """Return how far errors (H, n, E) fill bounds (n, n, H): (E,) in the worst direction.
+    """Return the ratio of errors (H, n, E) to bounds (n, n, H), (E,), in the worst direction.
 
-    The errors are whitened with the bounds, 1 is what a bound allows; the direction is that in
-    which they are largest over all times and episodes.
+    The bounds whiten the errors, so a bound allows 1; the direction has the largest errors over all
+    times and episodes.
     """
     root = np.linalg.inv(np.linalg.cholesky(np.moveaxis(bounds, -1, 0)))
     z = root @ errors
@@ -111,7 +111,7 @@ def leading(errors: Array, bounds: Array) -> Array:
 def simulate_filters(
     episodes: int, seed: int, settings: Settings, lanes: tuple[str, ...] = tuple(LANES)
 ) -> Data:
-    """Return all by example, ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane too."""
+    """Return all data by example, ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane too."""
     data: Data = {"lanes": list(lanes)}
     for example in EXAMPLES:
         result = _example(example, episodes, seed, settings, lanes)
@@ -146,16 +146,16 @@ def _example(
 
 
 def _under_the_trigger(system: UnknownInputSystem, rule: AdaptiveThreshold, record: Record) -> Data:
-    """The paper's figures, and how far errors fill their bounds.
+    """Return the data of the paper's figures, and the ratio of errors to bounds.
 
     Estimates are the fused one, then the nodes'. ``truth`` (H, s), ``local`` (H, l, s), ``fused``
     (H, s) and ``granted`` (H, l) are of the first episode; ``square`` and ``bound`` (H, l + 1, s)
     are mean squared errors and bounds; ``each`` (l + 1, 2, E) squared errors and ``filled``
-    (l + 1, 2, E) how far they fill their bounds, of states and inputs; ``power`` (2, E) the mean
-    square of both, ``steady`` (2, E) the fused squared errors in the two halves of the episodes;
+    (l + 1, 2, E) their ratio to the bounds, of states and inputs; ``power`` (2, E) the mean square
+    of both, ``steady`` (2, E) the fused squared errors in the two halves of the episodes;
     ``within`` the share of silent steps with |σ|² at most ρ̄; ``rho_range`` the least step of the
-    thresholds and their extremes over ρ₀ and ρ̄; ``settled`` (E,) the judgements after which every
-    threshold is at 99 % of ρ̄ at least.
+    thresholds and their extremes over ρ₀ and ρ̄; ``settled`` (E,) the number of updates until every
+    threshold is at 99 % of ρ̄.
     """
     nodes = system.nodes
     assert isinstance(nodes, TableNodes)
@@ -224,9 +224,9 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
 
     ``node`` (readings, l, 2, E): mean squared errors of state and input; ``trace``
     (readings, l, E): the mean trace of (18); ``hidden`` (readings, l): the largest residual of
-    (14); ``power`` (2, E): the mean squares of state and input themselves. ``excess``
-    (examples, E) of (18) over its least, ``sent`` and ``silent`` (l, E) traces of Ξ_x on the
-    printed example, ``negative``: the share of silent instants with an indefinite Ξ_x.
+    (14); ``power`` (2, E): the mean squares of state and input. ``excess`` (examples, E) of (18)
+    over its least, ``sent`` and ``silent`` (l, E) traces of Ξ_x on the printed example,
+    ``negative``: the share of silent instants with an indefinite Ξ_x.
     """
     data: Data = {"readings": list(recursion.UNKNOWN_INPUT_READINGS)}
     node, trace, hidden = [], [], []
@@ -265,7 +265,7 @@ def _recursion(
     cutoff: float = EXACT_CUTOFF,
     **options: Any,
 ) -> tuple[Record, list[dict[str, Array]]]:
-    """A run, and the printed filter of each node on what the trigger delivered."""
+    """Return a run, and the printed filter of each node on the trigger's deliveries."""
     task, system = make_example(example=example, filter="paper", **options)
     usual = make_example(example=example, filter="paper")[0]
     rho_bar = options.get("rho_bar", float(np.max(usual.policy_defaults[TRIGGER]["rho_bar"])))
@@ -317,7 +317,7 @@ def _time(data: Data) -> NDArray[np.int64]:
 
 
 def _curves(axis: Any, data: Data, example: str, entry: int) -> None:
-    """Truth, nodes, fused estimate and the Kalman filter; the fused and true values fill it."""
+    """Draw truth, nodes, fused estimate and the Kalman filter, scaled to fused and true values."""
     time = _time(data)
     truth, fused = (data[f"{example}_{name}"][:, entry] for name in ("truth", "fused"))
     local = data[f"{example}_local"][:, :, entry]
@@ -343,7 +343,7 @@ def _grid(figure: Any, data: Data, rows: int) -> Any:
 
 
 def _rank(label: str) -> int:
-    """The truth, the fused estimate, the nodes, the rest."""
+    """Order the truth, the fused estimate, the nodes, the rest."""
     return {"true value": 0, "fused": 1}.get(label, 2 if label.startswith("node") else 3)
 
 
@@ -371,7 +371,7 @@ def _labels(data: Data, example: str) -> list[tuple[str, str]]:
 
 
 def _draw_bounds(figure: Any, data: Data, entries: Entries, label: str, unit: str) -> None:
-    """Bounds solid, mean squared errors dotted, summed over the entries."""
+    """Draw bounds solid, mean squared errors dotted, summed over the entries."""
     axes = _grid(figure, data, 1)
     for column, example in enumerate(EXAMPLES):
         axis, places = axes[0, column], [entry for entry, _ in entries[example]]

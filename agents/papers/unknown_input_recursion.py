@@ -1,4 +1,4 @@
-"""The recursion (17)-(20) of unknown_input exactly as its text has it, and its readings."""
+"""The recursion (17)-(20) of unknown_input as printed, and its readings."""
 
 from typing import Any, NamedTuple
 
@@ -54,9 +54,9 @@ def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Mo
 
 
 def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
-    """Return L, N, Ξ_x of (17)-(20) from Ξ_x (E, n, n) of the last time; δ is ``silent``.
+    """Return L, N, Ξ_x of (17)-(20) from the last Ξ_x (E, n, n); δ is ``silent``.
 
-    ``best`` is the gain that minimises the same bound (18) among all that meet (14).
+    ``best`` is the gain that minimises the same bound (18) among all that satisfy (14).
     """
     a, b, c, v = model.transition, model.inputs, model.matrix, model.noise
     eye_n, eye_m, cb = np.eye(len(a)), np.eye(len(c)), c @ b
@@ -98,8 +98,8 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
     """Run a node's filter (8) on held measurements (H, m, E); times first, episodes second.
 
     ``estimate`` (H, E, s), ``trace`` (H, E) of Ξ_x, ``least`` (H, E) the smallest eigenvalue of
-    Ξ_x, ``hidden`` (H, E) the largest entry of ℬ - N C ℬ (14), and ``excess`` (H, E) how much
-    larger the trace of (18) is than with the best gain.
+    Ξ_x, ``hidden`` (H, E) the largest entry of ℬ - N C ℬ (14), and ``excess`` (H, E) the ratio of
+    the trace of (18) to that of the best gain.
     """
     episodes = held.shape[-1]
     mean = np.broadcast_to(model.mean, (episodes, len(model.mean)))
@@ -125,7 +125,7 @@ _TRACES = ("state_bound", "best_bound")
 
 
 def decoupling(paper: UnknownInputSystem, every_step: UnknownInputSystem) -> dict[str, Any]:
-    """Return rank and columns of C ℬ with ℬ as (3) prints it, for a = 2, and what bounds errors.
+    """Return rank and columns of C ℬ with ℬ as (3) prints it, for a = 2, and error bounds.
 
     ``conditions`` are the condition numbers of the C_i and of B, ``floor`` the result of
     :func:`_floor`.
@@ -143,7 +143,7 @@ def decoupling(paper: UnknownInputSystem, every_step: UnknownInputSystem) -> dic
 
 
 def _floor(system: UnknownInputSystem) -> list[list[float]]:
-    """Mean squared errors (l, 2) of state and input of C⁻¹ y, all that (14) leaves, always sent."""
+    """Return mean squared errors (l, 2) of C⁻¹ y, the only estimate that (14) allows."""
     b = system.plant.input_matrix[..., 0]
     result = []
     sensors = system.nodes.sensors

@@ -1,4 +1,4 @@
-"""The loop over the steps of episodes that all papers share, and policies of some sensors alone."""
+"""The loop over the steps of episodes of all papers, and policies of some sensors."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ def walk(
 def walk_in_parts(
     task: Task, policy: Policy | str, episodes: int, seed: int
 ) -> Iterator[tuple[int, slice, EpisodeBatch, Requests]]:
-    """Yield step from 0, runs, batch and requests as :func:`walk`, a part of the runs at a time."""
+    """Yield step, runs, batch and requests as :func:`walk`, one part of the runs at a time."""
     for first in range(0, episodes, BATCH):
         count = min(BATCH, episodes - first)
         for step, (batch, requests) in enumerate(walk(task, policy, count, seed + first)):
@@ -46,7 +46,7 @@ def walk_in_parts(
 class SomeSensors:
     """Another policy's requests of some sensors; the others never transmit.
 
-    ``round_robin`` would wait for them for ever: the turns of ``periodic`` come by the clock.
+    ``round_robin`` would wait for the others; the turns of ``periodic`` follow the clock.
     """
 
     policy: Policy
@@ -54,7 +54,7 @@ class SomeSensors:
     knowledge: Any = "own_memory"
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget everything."""
+        """Reset the other policy."""
         self.policy.reset(runs, seed)
 
     def __call__(self, signals: Signals) -> Requests:

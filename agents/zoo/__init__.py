@@ -1,1 +1,1 @@
-"""The zoo: one trained agent a class, small and ready to use."""
+"""The zoo: one trained agent per class."""

@@ -1,4 +1,4 @@
-"""A trained model's archive without what its optimiser remembers: a third of its size."""
+"""A trained model's archive without its optimiser's state: a third of its size."""
 
 import io
 import json
@@ -15,14 +15,7 @@ _BEGINNING = (1980, 1, 1, 0, 0, 0)  # of an archive's time: equal content gives 
 
 
 def small_model(path: Path) -> bytes:
-    """The archive with its parts compressed, without its runs, its optimiser as before the first
-    step.
-
-    Stable-Baselines3 loads it, and would train it on from there.
-
-    Raises:
-        ConfigurationError: it is no archive of a model.
-    """
+    """Return the compressed archive without runs, with the optimiser before its first step."""
     packed = io.BytesIO()
     try:
         with zipfile.ZipFile(path) as old, zipfile.ZipFile(packed, "w") as new:
@@ -41,7 +34,7 @@ def small_model(path: Path) -> bytes:
 
 
 def _without_runs(content: bytes) -> bytes:
-    """The settings alone: what the training's runs last saw is as large as the network."""
+    """Return the settings without the last observations of the training's runs."""
     data: dict[str, Any] = json.loads(content)
     return json.dumps(
         {key: None if key in _OF_RUNS else item for key, item in data.items()}
@@ -49,7 +42,7 @@ def _without_runs(content: bytes) -> bytes:
 
 
 def _unused(content: bytes) -> bytes:
-    """The optimiser's settings alone."""
+    """Return the optimiser's settings without its state."""
     import torch
 
     data: dict[str, Any] = torch.load(io.BytesIO(content), "cpu", weights_only=True)

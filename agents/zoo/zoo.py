@@ -2,9 +2,9 @@
 
     python -m agents.zoo [--settings NAME …] [--work runs/benchmark]
 
-The agent is that of the training seed with the least cost in validation, so its test figures stay
-honest. What the benchmark has not finished is done first. Agents of other names are removed. A
-model is kept as Stable-Baselines3 saved it, without the state of its optimiser.
+The training seed has the least cost in validation, so the test figures are unbiased. The command
+first runs the benchmark's unfinished work. It removes agents of other names. A model has
+Stable-Baselines3's format, without the state of its optimiser.
 """
 
 import hashlib
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from agents.benchmark.evidence import Class, gather
+from agents.benchmark.evidence import ClassEvidence, gather
 from agents.benchmark.jobs import Runner
 from agents.benchmark.settings import TEST_SEED, Suite, knowledge_of, load_suite
 from agents.workers import Pool
@@ -44,13 +44,15 @@ class Zoo(Long):
         """Write the agents, and remove the others."""
         suite, work = load_suite(settings=self.settings), (self.work / "full").absolute()
         classes = {
-            f"{of.setting.name}_{of.name}": of
-            for of in gather(suite, Runner(work, Pool(self.workers)))
+            f"{entry.setting.name}_{entry.name}": entry
+            for entry in gather(suite, Runner(work, Pool(self.workers)))
         }
-        models = {name: small_model(of.models[of.best_agent]) for name, of in classes.items()}
+        models = {
+            name: small_model(entry.models[entry.best_agent]) for name, entry in classes.items()
+        }
         writing((f"{len(models)} agents with their cards", self.zoo))
-        for name, of in classes.items():
-            write(self.zoo / f"{name}.json", agent_card(suite, of, models[name]))
+        for name, entry in classes.items():
+            write(self.zoo / f"{name}.json", agent_card(suite, entry, models[name]))
             with replacing(self.zoo / f"{name}.zip") as partial:
                 partial.write_bytes(models[name])
             print(f"zoo:{name}")
@@ -58,25 +60,25 @@ class Zoo(Long):
             print(f"zoo:{name} is removed")
 
 
-def agent_card(suite: Suite, of: Class, model: bytes) -> dict[str, Any]:
-    """Return what an agent's JSON says."""
-    seed = of.best_agent
-    experiment = suite.experiment(of.setting, of.name, of.prices, seed)
+def agent_card(suite: Suite, entry: ClassEvidence, model: bytes) -> dict[str, Any]:
+    """Return the content of an agent's JSON."""
+    seed = entry.best_agent
+    experiment = suite.experiment(entry.setting, entry.name, entry.prices, seed)
     options = dict(experiment.environment.options)
     for name in ("cost_weight", "price_range"):
         options.pop(name)
     return {
         "sha256": hashlib.sha256(model).hexdigest(),
-        "env": of.setting.environment,
+        "env": entry.setting.environment,
         "options": options,
-        "class": of.name,
-        "knows": knowledge_of(of.setting, of.name),
+        "class": entry.name,
+        "knows": knowledge_of(entry.setting, entry.name),
         "training": experiment.model_dump(mode="json", exclude={"output"}),
-        "command": f"python -m agents.zoo --settings {of.setting.name}, training seed {seed}",
+        "command": f"python -m agents.zoo --settings {entry.setting.name}, training seed {seed}",
         "test": {
             "episodes": suite.episodes,
             "seed": TEST_SEED,
-            "prices": list(of.prices),
+            "prices": list(entry.prices),
             "points": [
                 {
                     "cost": float(outcome.cost.mean()),
@@ -85,14 +87,14 @@ def agent_card(suite: Suite, of: Class, model: bytes) -> dict[str, Any]:
                     "mse": outcome.mse,
                     "rate": outcome.rate,
                 }
-                for outcome in of.tests["agent"][seed]
+                for outcome in entry.tests["agent"][seed]
             ],
         },
     }
 
 
 def remove_others(folder: Path, names: Iterable[str]) -> list[str]:
-    """Remove the agents of other names, each a model beside its card, and return their names."""
+    """Remove the agents of other names, each with its card, and return their names."""
     removed = []
     for model in sorted(folder.glob("*.zip")):
         file = model.with_suffix(".json")
