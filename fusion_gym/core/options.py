@@ -23,7 +23,7 @@ ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
 Action = Literal["binary", "discrete"]
-# What the scale of the reward depends on, beside plant and sensors.
+# Options that affect the scale of the reward, besides plant and sensors.
 _SCALING = (
     "access", "tokens", "token_rate", "token_capacity", "initial_tokens", "token_cost", "sharing",
     "horizon",

@@ -1,4 +1,4 @@
-"""A few steps of a task before it is handed out: what float64 cannot hold shows at once."""
+"""A short simulation of a task that detects numbers beyond float64."""
 
 import numpy as np
 
@@ -10,10 +10,13 @@ _STEPS = 8
 
 
 def rehearse(task: Task) -> None:
-    """Three runs: one in which nobody requests, one with all requests, one with every other one.
+    """Simulate runs without requests, with all requests and with every second request.
+
+    Args:
+        task: The task.
 
     Raises:
-        ConfigurationError: an observation, estimate or reward that is not finite.
+        ConfigurationError: An observation, estimate or reward is not finite.
     """
     sensors = np.arange(task.sensors)
     try:

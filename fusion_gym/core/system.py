@@ -32,7 +32,7 @@ MEANING: dict[Knowledge, str] = {
     "own_memory": "the same as own, and what that sensor measured and did not send",
     "scheduler_memory": "the same as scheduler, and what all sensors measured and did not send",
 }
-# What each class knows besides itself.
+# Classes that each class covers besides itself.
 _BELOW: dict[Knowledge, tuple[Knowledge, ...]] = {
     "clock": (),
     "centre": ("clock",),
@@ -103,7 +103,7 @@ class Signal:
         validation.choice("knowledge", self.knowledge, KNOWLEDGE)
 
 
-# The signals of every system, and what they are where the system does not say otherwise.
+# The signals of every system with their default meanings.
 _COMMON: tuple[tuple[str, Knowledge, str], ...] = (
     ("measurement", "own", "the new measurement"),
     ("innovation", "own", "measurement minus its expectation"),
@@ -317,7 +317,7 @@ class Signals(Mapping[str, SignalArray]):
         return sum(1 for _ in self)
 
 
-# What a system may have beside what every system has.
+# Methods and properties that a system may implement.
 CAPABILITIES = (
     *("adopt", "arrival_probability", "arriving", "covariance_cycle", "error_covariance"),
     *("fused_alone", "imagination_channels", "imagine", "with_actual_covariance"),
