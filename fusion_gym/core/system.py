@@ -467,8 +467,9 @@ class System(ABC, Generic[StateT]):
         Args:
             horizon: Steps of an episode.
 
-        Returns: The largest mean square of a measurement over its noise variance, and the largest
-            ratio of a predicted variance to the variance after a packet that ends a silence.
+        Returns:
+            The largest mean square of a measurement over its noise variance, and the largest ratio
+            of a predicted variance to the variance after a packet that ends a silence.
         """
         return 0.0, 0.0
 
