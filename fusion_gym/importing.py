@@ -52,16 +52,7 @@ def imported(field: str, text: str, module: str) -> ModuleType:
 
 
 def import_named(field: str, text: str) -> Any:
-    """Return the object of ``module:name``.
-
-    Args:
-        field: Name of the setting, for the message.
-        text: ``module:name``.
-
-    Raises:
-        ConfigurationError: The text has another form, the module cannot be imported, or it has no
-            such name.
-    """
+    """Return the object of ``module:name``, or raise a ``ConfigurationError``."""
     module, _, name = text.partition(":")
     if not (name and all(part.isidentifier() for part in [*module.split("."), name])):
         raise ConfigurationError(f"{field} = {text!r} is not allowed: it must be 'module:name'")
@@ -74,16 +65,7 @@ def import_named(field: str, text: str) -> Any:
 
 
 def require(user: str, extra: str, *packages: str) -> None:
-    """Check that the packages of an extra are installed.
-
-    Args:
-        user: Name of the feature that needs the packages.
-        extra: Extra of fusion-gym that installs them.
-        *packages: Names of the packages.
-
-    Raises:
-        ConfigurationError: A package is absent.
-    """
+    """Check that the packages of an extra are installed."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
             absent = f"{user} needs {package}, which is absent"

@@ -131,15 +131,7 @@ def _inverse_of_stack(stack: FloatArray) -> FloatArray:
 
 
 def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the matrix-vector product ``(..., n, N)``.
-
-    Args:
-        a: ``(..., n, k, N)``.
-        v: ``(..., k, N)``.
-
-    Raises:
-        ValueError: The two axes of length k differ.
-    """
+    """Return the product ``a v``, ``(..., n, N)``, of ``(..., n, k, N)`` and ``(..., k, N)``."""
     length = a.shape[-2]
     _require_equal_lengths("matvec", length, v.shape[-2])
     if min(a.shape[-3], length) >= _LARGE:
@@ -156,15 +148,7 @@ def outer(u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def dot(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the inner product ``u^T v``, ``(..., N)``.
-
-    Args:
-        u: ``(..., n, N)``.
-        v: ``(..., n, N)``.
-
-    Raises:
-        ValueError: The two axes of length n differ.
-    """
+    """Return the inner product ``u^T v``, ``(..., N)``, of two vectors ``(..., n, N)``."""
     length = u.shape[-2]
     _require_equal_lengths("dot", length, v.shape[-2])
     result: FloatArray = u[..., 0, :] * v[..., 0, :]
@@ -174,15 +158,7 @@ def dot(u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def quadratic(v: FloatArray, a: FloatArray) -> FloatArray:
-    """Return the quadratic form ``v^T a v``, ``(..., N)``.
-
-    Args:
-        v: ``(..., n, N)``.
-        a: ``(..., n, n, N)``.
-
-    Raises:
-        ValueError: The sizes of `v` and `a` differ.
-    """
+    """Return ``v^T a v``, ``(..., N)``, of ``(..., n, N)`` and ``(..., n, n, N)``."""
     return dot(v, matvec(a, v))
 
 

@@ -111,7 +111,7 @@ class Memory:
         return self._beliefs
 
     def deliver(self, state: Any, delivered: Any, granted: NDArray[np.bool_]) -> Any:
-        """Update the memory after the network's grants, and return the delivered state.
+        """Update the memory after grants (sensors, N) in the runs' sensed state.
 
         With ``packet="estimate"`` the centre of the returned state has x* where a packet arrived.
 

@@ -93,15 +93,7 @@ class Nature:
         return own, departure
 
     def check_growth(self, radius: Callable[[float], float], horizon: int) -> None:
-        """Raise an error if the true plant grows beyond ``_LARGEST_GROWTH`` over an episode.
-
-        Args:
-            radius: Spectral radius of the true plant as a function of c.
-            horizon: Steps of an episode.
-
-        Raises:
-            ConfigurationError: The plant grows beyond the limit.
-        """
+        """Raise an error if the true plant with spectral radius ``radius(c)`` grows too much."""
         ends = {self.low[-1], self.high[-1]} - {_MODEL[-1]}
         largest = max((radius(end) for end in ends), default=0.0)
         if 2.0 * horizon * np.log10(max(largest, 1.0)) > np.log10(_LARGEST_GROWTH):
@@ -112,15 +104,7 @@ class Nature:
             )
 
     def refuse(self, where: str, why: str = "that holds where the truth is as assumed") -> None:
-        """Raise an error if the truth departs from the model.
-
-        Args:
-            where: Place of the restriction, for the message.
-            why: Reason of the restriction, for the message.
-
-        Raises:
-            ConfigurationError: The truth departs from the model.
-        """
+        """Raise an error if the truth departs from the model, with place and reason."""
         for name in self.departing:
             raise ConfigurationError(
                 f"{name} = {self._given(name)} is not allowed {where}: it must be "

@@ -213,16 +213,7 @@ class ObservationLayout:
     def encode(
         self, state: Any, network: NetworkState, beliefs: Callable[[], Beliefs]
     ) -> NDArray[np.float32]:
-        """Return observations (N, entries) float32, clipped to their bounds.
-
-        Args:
-            state: The system's state after sensing.
-            network: The network's part.
-            beliefs: Function that returns the beliefs, called only for belief blocks.
-
-        Raises:
-            ValueError: A block's value does not have the declared shape.
-        """
+        """Return observations (N, entries) float32, clipped to their bounds."""
         filled = [block.fill(state) for block in self._own]
         filled += [block.fill(beliefs()) for block in self._memory]
         filled += [block.fill(network) for block in self._network]

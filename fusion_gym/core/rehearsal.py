@@ -10,14 +10,7 @@ _STEPS = 8
 
 
 def rehearse(task: Task) -> None:
-    """Simulate runs without requests, with all requests and with every second request.
-
-    Args:
-        task: The task.
-
-    Raises:
-        ConfigurationError: An observation, estimate or reward is not finite.
-    """
+    """Check that runs without, with all and with alternating requests remain finite."""
     sensors = np.arange(task.sensors)
     try:
         batch = EpisodeBatch.seeded(task, 3, seed=0)

@@ -23,14 +23,7 @@ _LARGEST = 1e32  # mean square; rewards become float32
 
 
 def equal_weights(open_loop: Array) -> Array:
-    """Return weights 1/(n vᵢ) (n,) of open-loop variances vᵢ, so that the open-loop error costs 1.
-
-    Args:
-        open_loop: Variances (n,).
-
-    Raises:
-        ConfigurationError: A variance is zero.
-    """
+    """Return weights 1/(n vᵢ) (n,) of open-loop variances vᵢ, so that open loop costs 1."""
     if np.any(open_loop <= 0.0):
         raise _at_rest(open_loop)
     return 1.0 / (len(open_loop) * open_loop)
@@ -249,14 +242,7 @@ class Price:
         return low * (high / low) ** uniform
 
     def encode(self, price: Array) -> Array:
-        """Return the position of prices in the logarithmic range, 0 to 1, in the same shape.
-
-        Args:
-            price: Prices.
-
-        Raises:
-            ConfigurationError: There is no range.
-        """
+        """Return the position of prices in the logarithmic range, from 0 to 1."""
         if self.span is None:
             raise ConfigurationError("price_range = None is not allowed here: no price is observed")
         low, high = self.span

@@ -145,11 +145,7 @@ class Runs:
         self.state = self.task.system.sense(self.delivered, noise)
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
-        """Return independent runs from the given runs, in this order and possibly repeated.
-
-        Args:
-            runs: Numbers of the runs; by default all. A finished run continues without a reset.
-        """
+        """Return independent copies of ``runs``, possibly repeated, by default of all."""
         memory = self.memory.branch(runs, len(self.steps))
         return Branch(self.task, memory, self.layout, self._position(runs))
 

@@ -31,15 +31,7 @@ _STORED: dict[tuple[Any, ...], Any] = {}
 
 
 def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array | None]:
-    """Return the options with numbers for ``"auto"``, and the nominal error if the reward scales.
-
-    Args:
-        options: The options.
-        build: Function from options to a scenario.
-
-    Raises:
-        ConfigurationError: A value is not allowed, or the plant has no such number.
-    """
+    """Return the options with numbers for ``"auto"``, and the nominal error or ``None``."""
     error, factor = None, options.reward_scale
     if factor is not None:
         error, whole = _stored(_nominal, options.nominal(), build)
@@ -84,14 +76,7 @@ def sustained_tokens(task: Task) -> float:
 
 
 def nominal_error(task: Task) -> Array:
-    """Return each state's mean squared error (n,) with requests at an even pace.
-
-    A sensor requests when its pace is due and the access rule admits it. Where no packet is
-    sustained, the result is the error without transmissions.
-
-    Args:
-        task: The task.
-    """
+    """Return each state's mean squared error (n,) with requests at an even pace."""
     rate, sensors = nominal_rate(task.bucket, task.access), task.sensors
     if rate == 0.0:
         return task.open_loop[:, 0]
@@ -114,9 +99,6 @@ def price_range(task: Task) -> tuple[float, float]:
 
     Args:
         task: The task.
-
-    Raises:
-        ConfigurationError: No transmission lowers the error.
     """
     sustained = sustained_tokens(task)
     least = _PACKETS * float(task.bucket.cost.sum()) / task.horizon
@@ -126,16 +108,7 @@ def price_range(task: Task) -> tuple[float, float]:
 
 
 def prices_at(spent: Array, error: Array, tokens: Array) -> Array:
-    """Return the prices at which the best of some policies spends ``tokens``.
-
-    Args:
-        spent: Tokens per step (policies,).
-        error: Error per step (policies,). Prices are slopes of the lower envelope.
-        tokens: Tokens per step.
-
-    Raises:
-        ConfigurationError: No policy that transmits has a lower error.
-    """
+    """Return the slopes of the lower envelope where the best policy spends ``tokens``."""
     spent, error = _envelope(spent, error)
     if len(spent) < 3:
         raise ConfigurationError(

@@ -77,21 +77,7 @@ class TokenBucket:
         sharing: str = "equal",
         unlimited: bool = False,
     ) -> TokenBucket:
-        """Return a bucket with checked numbers.
-
-        Args:
-            rate: Tokens per step, >= 0.
-            capacity: Largest number of tokens.
-            initial: Tokens at the start of an episode.
-            cost: Tokens per packet, > 0: one number or one per sensor.
-            sensors: Number of sensors.
-            sharing: A sharing rule.
-            unlimited: Whether every request is granted.
-
-        Raises:
-            ConfigurationError: A number or the rule is not allowed, or a sensor could never
-                transmit.
-        """
+        """Return a bucket with checked numbers; ``cost`` is one number or one per sensor."""
         costs = validation.positive("token_cost", cost, (sensors,))[:, None]
         limit = validation.number("token_capacity", capacity, above=0.0)
         rule = validation.choice("sharing", sharing, SHARING_RULES)

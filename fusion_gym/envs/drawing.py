@@ -78,13 +78,7 @@ class Film:
         title: str | None = None,
         limits: Sequence[tuple[float, float]] | None = None,
     ) -> Frame:
-        """Return the picture of a run's present episode.
-
-        Args:
-            run: Number of the run.
-            title: Title; by default the step.
-            limits: Axis limits of each drawn state; by default the limits of this run.
-        """
+        """Return the picture of a run's present episode, by default with the step as title."""
         if self._figure is None:
             self._draw_frame()
         age, steps = int(self._ages[run]), self._steps_of(run)
@@ -203,15 +197,7 @@ class Film:
 
 
 class Window:
-    """A window that shows frames at a fixed rate.
-
-    Args:
-        title: Title of the window.
-        fps: Frames per second.
-
-    Raises:
-        ConfigurationError: pygame is absent.
-    """
+    """A window that shows ``fps`` frames per second; it needs pygame."""
 
     def __init__(self, title: str, fps: int) -> None:
         require("render_mode", "render", "pygame")

@@ -240,7 +240,7 @@ def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MOD
 
 
 def rewards_of(task: Task, outcome: Outcome) -> NDArray[np.float64]:
-    """The rewards (N,) of a step, or (N, 2): what the error and what the tokens cost."""
+    """Return the rewards (N,) of a step, or (N, 2) with error term and token term."""
     if not task.vector_reward:
         return outcome.reward
     return np.stack([outcome.reward_error, outcome.reward_communication], axis=-1)
