@@ -1,4 +1,4 @@
-"""fusion-gym: Gymnasium environments that ask when a measurement is worth transmitting.
+"""fusion-gym: Gymnasium environments for networked estimation under a limit on transmissions.
 
 Importing the package registers its environments with Gymnasium.
 """
@@ -39,7 +39,7 @@ __all__ = [
     "zoo",
 ]
 
-# Faces and their modules; the package of most is part of the extra "agents".
+# Interfaces and their modules; most need the extra "agents".
 _INTERFACES = {
     "FusionEnv": "single",
     "FusionVectorEnv": "vector",
@@ -53,14 +53,14 @@ register()
 
 
 def __dir__() -> list[str]:
-    """Also what is imported when it is first asked for."""
+    """Return all public names, including the names that are imported on first access."""
     return sorted({*globals(), *__all__})
 
 
-if not TYPE_CHECKING:  # a type checker knows the names above, and no others
+if not TYPE_CHECKING:  # type checkers see only the names above
 
     def __getattr__(name: str) -> Any:
-        """Stable-Baselines3, torch and PettingZoo are imported only where they are used."""
+        """Import an interface and its optional packages on first access."""
         if name in _INTERFACES:
             try:
                 return getattr(

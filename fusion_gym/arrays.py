@@ -1,4 +1,4 @@
-"""Arrays of runs: quantities of shape (…, N), and records of them, with the batch axis last."""
+"""Arrays of N runs with the batch axis last, and records of such arrays."""
 
 import dataclasses
 from typing import Any
@@ -10,10 +10,11 @@ Array = NDArray[np.float64]
 
 
 def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
-    """The given runs of a state, in this order and possibly again and again.
+    """Return the given runs of a state, in this order and possibly repeated.
 
-    Through dataclasses and named tuples, whose arrays have the batch as last axis, and functions
-    that return such.
+    Args:
+        state: Dataclasses and named tuples of arrays (…, N), or functions that return them.
+        runs: Numbers of the runs.
     """
     if isinstance(state, np.ndarray):
         return state.take(runs, axis=-1)
@@ -29,7 +30,7 @@ def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
 
 
 def merge_runs(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:
-    """``old`` with the given runs replaced by ``new``, through dataclasses and named tuples."""
+    """Return ``old`` with ``new`` in the given runs, through dataclasses and named tuples."""
     if isinstance(old, np.ndarray):
         result = old.copy()
         result[..., runs] = new

@@ -1,4 +1,4 @@
-"""Declarations of options: a dataclass's field with its type, default and docstring (PEP 257)."""
+"""Declarations of options: the type, default and docstring of a dataclass field (PEP 257)."""
 
 import ast
 import functools
@@ -12,15 +12,15 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from fusion_gym import validation
 
-# Shown by their names, for what they stand for fills a page.
+# Types that are shown by name, because their definitions are long.
 _NAMES = {name: type(name, (), {}) for name in ("ArrayLike", "Array")}
 
 
 def hints(kind: type) -> dict[str, Any]:
-    """Return the types of a dataclass's fields, none where a name in them is unknown."""
+    """Return the types of a dataclass's fields, or none if a name in them is unknown."""
     try:
         return get_type_hints(kind, localns=_NAMES, include_extras=True)
-    except NameError:  # of a class inside a function
+    except NameError:  # a class inside a function
         return {}
 
 
@@ -30,7 +30,7 @@ def meanings(kind: type) -> dict[str, str]:
     for owner in reversed(kind.__mro__):
         try:
             (source,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
-        except (OSError, TypeError, SyntaxError):  # it has no source: built in, or made at run time
+        except (OSError, TypeError, SyntaxError):  # a class without source
             continue
         for field, below in itertools.pairwise(getattr(source, "body", ())):
             match field, below:
@@ -43,10 +43,7 @@ def meanings(kind: type) -> dict[str, str]:
 
 
 def choices(hint: Any) -> tuple[Any, ...]:
-    """Return all values of a type that has a few: those of a ``Literal``, or the names of a table.
-
-    ``Annotated[str, table]`` stands for the names in a table; ``None`` is not among the values.
-    """
+    """Return all values of a ``Literal`` or ``Annotated[str, table]`` type except ``None``."""
     if get_origin(hint) is Annotated:
         return tuple(hint.__metadata__[0])
     parts = [part for part in _parts(hint) if part is not NoneType]
@@ -54,7 +51,7 @@ def choices(hint: Any) -> tuple[Any, ...]:
 
 
 def type_text(hint: Any) -> str:
-    """Return a type in words of Python, with all values that a ``Literal`` or a table has."""
+    """Return a type as Python text, with all values of a ``Literal`` or a table."""
     if get_origin(hint) is Annotated:
         names = " | ".join(map(repr, choices(hint)))
         return " | ".join(names if part is str else type_text(part) for part in _parts(hint))
@@ -66,17 +63,11 @@ def type_text(hint: Any) -> str:
     return re.sub(r"[\w.]+\.(?=\w)", "", text)
 
 
-_hints_of = functools.cache(hints)  # for every object of options is checked
+_hints_of = functools.cache(hints)  # cached, because every options object is checked
 
 
 def check(options: Any) -> None:
-    """Check the options that are declared as ``Literal``, ``bool`` or a name of a table.
-
-    Names that a function offers are left to it, for it says why others are refused.
-
-    Raises:
-        ConfigurationError: a value that the type does not have.
-    """
+    """Check the options that are declared as ``Literal``, ``bool`` or a name of a table."""
     for name, hint in _hints_of(options.__class__).items():
         value, parts = getattr(options, name), _parts(hint)
         table = hint.__metadata__[0] if get_origin(hint) is Annotated else {}
@@ -89,6 +80,6 @@ def check(options: Any) -> None:
 
 
 def _parts(hint: Any) -> tuple[Any, ...]:
-    """The members of a union, or the type itself."""
+    """Return the members of a union, or the type as the only member."""
     inner = hint.__origin__ if get_origin(hint) is Annotated else hint
     return get_args(inner) if get_origin(inner) in (Union, UnionType) else (inner,)

@@ -1,4 +1,4 @@
-"""Docstrings as declarations: a summary, and paragraphs behind labels such as ``Source:``; tables.
+"""Docstrings as declarations: a summary, and sections with labels such as ``Source:``.
 
 A label stands at the beginning of a paragraph; indented paragraphs below belong to it.
 """
@@ -14,25 +14,25 @@ _ARGUMENT = re.compile(r"^(\w+): (.*(?:\n .*)*)", re.MULTILINE)
 
 
 class Docstring(NamedTuple):
-    """The text without label, and the text behind each label."""
+    """The text without labels, and the text of each label."""
 
     text: str
     labelled: dict[str, str]
 
     @property
     def summary(self) -> str:
-        """The first sentence, in one line."""
+        """First sentence, in one line."""
         return re.split(r"(?<=[.])\s", " ".join(self.text.split()), maxsplit=1)[0]
 
     @property
     def arguments(self) -> dict[str, str]:
-        """The meaning of each argument, by the section ``Args``."""
+        """Meaning of each argument in the section ``Args``."""
         result = _ARGUMENT.findall(self.labelled.get("Args", ""))
         return {name: " ".join(meaning.split()) for name, meaning in result}
 
 
 def read(owner: Any) -> Docstring:
-    """Return the docstring of a class or function in parts; ``Sources`` stands as ``Source``."""
+    """Return the parsed docstring of a class or function, with ``Sources`` as ``Source``."""
     text: list[str] = []
     labelled: dict[str, list[str]] = {}
     section = text
@@ -54,7 +54,7 @@ def plain_marks(text: str) -> str:
 
 
 def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    """Return a Markdown table, the columns of its source aligned."""
+    """Return a Markdown table with aligned source columns."""
     lines = [head, *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(head) - 1)]
     padded = ["| " + " | ".join(map(str.ljust, line, (*widths, 0))) + " |" for line in lines]

@@ -1,4 +1,4 @@
-"""Errors in what a user hands in: one line with the field, its value and what is allowed."""
+"""Errors in user input: one line with the field, its value and the allowed values."""
 
 from __future__ import annotations
 
@@ -13,9 +13,17 @@ _SHOWN = 160  # characters of a value in a message
 
 
 class ConfigurationError(ValueError):
-    """A setting that cannot be used; the message names the field, its value and what is allowed.
+    """Report a setting that cannot be used, in one line with its field, value and allowed values.
 
-    The message is one line, whatever values it shows.
+    Args:
+        message: The message; line breaks become spaces.
+
+    Example:
+        >>> import fusion_gym
+        >>> fusion_gym.make_task("fusion_gym/TobitOscillator-v1", horizon=0)
+        Traceback (most recent call last):
+            ...
+        fusion_gym.errors.ConfigurationError: horizon = 0 is not allowed: it must be ...
     """
 
     def __init__(self, message: str) -> None:
@@ -23,15 +31,11 @@ class ConfigurationError(ValueError):
 
 
 class UnexpectedArgumentError(ConfigurationError, TypeError):
-    """An argument that is not known: a ``TypeError`` too, as of any call with such an argument.
-
-    Whoever tries out which options there are takes that for an answer: Stable-Baselines3 with
-    ``render_mode``, TorchRL with ``frameskip``.
-    """
+    """An unknown argument, also a ``TypeError``, as Stable-Baselines3 and TorchRL expect it."""
 
     @classmethod
     def of(cls, owner: str, name: str, reason: str) -> UnexpectedArgumentError:
-        """The argument ``name`` of ``owner``, in the words that Python has for it."""
+        """Return the error for the argument ``name`` of ``owner``, in Python's own words."""
         return cls(f"{owner} got an unexpected keyword argument {name!r}: {reason}")
 
 
@@ -40,22 +44,22 @@ class DivergenceError(FloatingPointError):
 
 
 def refusal(field: str, value: Any, allowed: str, where: str = "") -> ConfigurationError:
-    """The error of a field whose value is not what is allowed; ``where``, if not everywhere."""
+    """Return the error of a field whose value is not allowed, in general or only ``where``."""
     refused = f"{field} = {display(value)} is not allowed {where}".rstrip()
     return ConfigurationError(f"{refused}: it must be {allowed}")
 
 
 def display(value: Any) -> str:
-    """A value as Python writes it, arrays as lists, on one line, and cut where it is long."""
+    """Return a value's ``repr`` in one line, with arrays as lists, cut at ``_SHOWN`` characters."""
     try:
         text = " ".join(repr(_plain(value, itertools.count())).split())
-    except Exception:  # whatever a class of the user's raises
+    except Exception:  # a user's class may raise any exception
         text = f"<{type(value).__name__}>"
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
 def _plain(value: Any, shown: Iterator[int]) -> Any:
-    """Arrays as lists, also those within lists; of long ones as much as is ``shown``."""
+    """Return a value with arrays as lists, cut after ``_SHOWN`` entries."""
     if next(shown) > _SHOWN:
         return ...
     if isinstance(value, np.ndarray):
@@ -69,5 +73,5 @@ def _plain(value: Any, shown: Iterator[int]) -> Any:
 
 
 def nearest(value: Any, known: Iterable[str]) -> str | None:
-    """The known name that was probably meant."""
+    """Return the closest known name, or ``None``."""
     return next(iter(difflib.get_close_matches(str(value), list(known), n=1)), None)

@@ -36,7 +36,7 @@ _DENSITY_SCALE = float(1.0 / np.sqrt(2.0 * np.pi))
 _FAR = 7.0
 _TERMS = 20
 
-# Beyond 39 the tail underflows, so an end of an interval this far out might as well be infinite.
+# The tail underflows beyond 39, so such an end of an interval is equivalent to infinity.
 _OUTER = 100.0
 
 # Intervals with width * (1 + |midpoint|) below the limit: the density varies by less than a
@@ -48,7 +48,7 @@ _WEIGHTS = 0.5 * _WEIGHTS
 
 
 class TobitMoments(NamedTuple):
-    """What a filter needs of a standard normal that is observed only above z, each of z's shape."""
+    """Moments of a standard normal that is observed only above z, each of z's shape."""
 
     uncensored_probability: FloatArray
     """Q(z), the probability of exceeding z."""
@@ -61,7 +61,7 @@ class TobitMoments(NamedTuple):
 
 
 class IntervalMoments(NamedTuple):
-    """Probability of an interval, and a standard normal's mean and variance given it."""
+    """Probability of an interval, and mean and variance of a standard normal in it."""
 
     probability: FloatArray
     mean: FloatArray
@@ -69,7 +69,7 @@ class IntervalMoments(NamedTuple):
 
 
 def _far_tail(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Excess and variance beyond z from the continued fraction, for z at least `_FAR`."""
+    """Return excess and variance beyond z from the continued fraction, for z at least `_FAR`."""
     remainder = _TERMS / z
     for k in range(_TERMS - 1, 1, -1):
         remainder = k / (z + remainder)
@@ -78,7 +78,7 @@ def _far_tail(z: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _tail(z: FloatArray, scaled: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Hazard, excess and variance beyond z, given scaled = erfcx(z / sqrt 2)."""
+    """Return hazard, excess and variance beyond z from scaled = erfcx(z / sqrt 2)."""
     hazard_ = np.asarray(_HAZARD_SCALE / scaled)
     excess = np.asarray(hazard_ - z)
     variance = np.asarray(1.0 - hazard_ * np.minimum(excess, 1e300))
@@ -92,43 +92,37 @@ def _tail(z: FloatArray, scaled: FloatArray) -> tuple[FloatArray, FloatArray, Fl
 
 @np.errstate(all="ignore")
 def _beyond(z: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Hazard, excess and variance beyond z."""
+    """Return hazard, excess and variance beyond z."""
     z = np.asarray(z, dtype=np.float64)
     return _tail(z, erfcx(_ROOT_HALF * z))
 
 
 @np.errstate(all="ignore")
 def density(z: ArrayLike) -> FloatArray:
-    """Standard normal density ``phi(z) = exp(-z^2 / 2) / sqrt(2 pi)``, of z's shape."""
+    """Return the standard normal density ``phi(z) = exp(-z^2 / 2) / sqrt(2 pi)``."""
     z = np.asarray(z, dtype=np.float64)
     return _DENSITY_SCALE * np.exp(-0.5 * z * z)
 
 
 @np.errstate(all="ignore")
 def upper_tail(z: ArrayLike) -> FloatArray:
-    """Probability ``Q(z) = 1 - Phi(z)`` of exceeding z, of z's shape, accurate in the tail."""
+    """Return the probability ``Q(z) = 1 - Phi(z)`` of exceeding z, accurate in the tail."""
     return ndtr(-np.asarray(z, dtype=np.float64))
 
 
 def hazard(z: ArrayLike) -> FloatArray:
-    """Mean ``phi(z) / Q(z)`` of a standard normal given that it exceeds z, of z's shape.
-
-    Increasing, close to z for large z; it underflows to zero below about -38.
-    """
+    """Return the mean ``phi(z) / Q(z)`` of a standard normal given that it exceeds z."""
     return _beyond(z)[0]
 
 
 def truncated_variance(z: ArrayLike) -> FloatArray:
-    """Variance ``1 - h (h - z)`` of a standard normal given that it exceeds z, of z's shape.
-
-    Decreases from 1 for z far below zero; close to 1 / z^2 for large z.
-    """
+    """Return the variance ``1 - h (h - z)`` of a standard normal given that it exceeds z."""
     return _beyond(z)[2]
 
 
 @np.errstate(all="ignore")
 def tobit_moments(z: ArrayLike) -> TobitMoments:
-    """Tail probability, hazard, excess and truncated variance together, each of z's shape.
+    """Return tail probability, hazard, excess and truncated variance, each of z's shape.
 
     Args:
         z: ``(threshold - predicted measurement) / standard deviation``. Minus infinity stands
@@ -139,7 +133,7 @@ def tobit_moments(z: ArrayLike) -> TobitMoments:
 
 
 def _truncate(near: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Replace ends so far out that nothing lies beyond them by finite ones."""
+    """Replace ends beyond which the probability is zero by finite ones."""
     near = np.maximum(near, -_OUTER)
     return near, np.minimum(width, _OUTER - np.minimum(near, 0.0))
 
@@ -147,14 +141,15 @@ def _truncate(near: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArr
 def _inside(
     near: FloatArray, width: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Moments inside (near, near + width), finite and with its midpoint not below zero.
+    """Return probability, distance of the mean from the near end, mean and variance in an interval.
 
     The general formulas subtract the tail beyond the far end from the tail beyond the near end,
-    weighted by rho = Q(far) / Q(near). For narrow intervals they cancel, and the integrals of
-    the density relative to its value at the near end are taken by Gauss-Legendre quadrature.
+    weighted by rho = Q(far) / Q(near). For narrow intervals they cancel, and Gauss-Legendre
+    quadrature integrates the density relative to its value at the near end.
 
-    Returns:
-        probability, distance of the mean from the near end, mean, variance.
+    Args:
+        near: Near end, finite; the midpoint is not below zero.
+        width: Width of the interval, finite.
     """
     far = near + width
     ends = np.stack(np.broadcast_arrays(near, far))
@@ -172,7 +167,7 @@ def _inside(
 
     narrow = width * (1.0 + 0.5 * (near + far)) < _NARROW
     if narrow.any():
-        # The nodes lie on the last axis, so that every lane is summed in the same order.
+        # The nodes lie on the last axis, so that every element has the same order of summation.
         start, span = near[narrow], width[narrow]
         step = span[:, None] * _NODES
         values = _WEIGHTS * np.exp(-step * (start[:, None] + 0.5 * step))
@@ -188,15 +183,15 @@ def _inside(
 
 @np.errstate(all="ignore")
 def interval_moments(low: ArrayLike, high: ArrayLike) -> IntervalMoments:
-    """Probability of ``low < z < high`` and moments of a standard normal z given that.
+    """Return the probability of ``low < z < high`` and the moments of z given that.
 
     Args:
-        low: lower end; minus infinity is allowed.
-        high: upper end, broadcasting with `low`; infinity is allowed.
+        low: Lower end; minus infinity is allowed.
+        high: Upper end, broadcasting with `low`; infinity is allowed.
 
     Returns:
-        Probability, mean and variance, each of the broadcast shape. Mean and variance stay
-        right where the probability underflows to zero, some 38 deviations out.
+        Probability, mean and variance, each of the broadcast shape. Mean and variance are accurate
+        even where the probability underflows to zero, some 38 deviations out.
 
     Raises:
         ValueError: `low` is not below `high` somewhere, or one of them is NaN.

@@ -1,6 +1,6 @@
-"""What a user names as ``module:name``: imported, or one error that says what is wrong.
+"""Import of user code by ``module:name``, with one error that states the cause.
 
-A file may name code where the user trusts it: with ``--trust``, or in :func:`trust_files`.
+A file may name code only if the user trusts it: with ``--trust``, or in :func:`trust_files`.
 """
 
 import contextlib
@@ -15,13 +15,13 @@ from typing import Any
 from fusion_gym.validation import ConfigurationError, nested
 
 TRUST: ContextVar[bool] = ContextVar("trust", default=False)
-_ENVIRONMENTS = ("env", "environment", "id", "error")  # whose texts name code by any colon
+_ENVIRONMENTS = ("env", "environment", "id", "error")  # keys whose values with a colon name code
 _POLICY = re.compile(r"(?:^|base=)\s*(?!(?:model|zoo):)[^\W\d][\w.]*:\s*[^\W\d]\w*\s*(?::|$)")
 
 
 @contextlib.contextmanager
 def trust_files(trust: bool = True) -> Iterator[None]:
-    """Allow files to name code of the user's, as ``--trust`` does, while this is entered."""
+    """Allow files to name code inside this context, as ``--trust`` does."""
     token = TRUST.set(trust or TRUST.get())
     try:
         yield
@@ -30,11 +30,7 @@ def trust_files(trust: bool = True) -> Iterator[None]:
 
 
 def refuse_code(content: Any, source: str) -> None:
-    """Refuse a file's content that names code to import, unless files are trusted.
-
-    Raises:
-        ConfigurationError: an ``error``, an environment or a policy of the form ``module:name``.
-    """
+    """Raise a ``ConfigurationError`` if an untrusted file names code to import."""
     for key, part in () if TRUST.get() else nested("file", content):
         text = part if isinstance(part, str) else ""
         if ":" in (key + text if key in _ENVIRONMENTS else key) or _POLICY.search(text):
@@ -44,14 +40,10 @@ def refuse_code(content: Any, source: str) -> None:
 
 
 def imported(field: str, text: str, module: str) -> ModuleType:
-    """The module of this name, of what a user gave as ``text``.
-
-    Raises:
-        ConfigurationError: it cannot be imported.
-    """
+    """Return the module, or raise a ``ConfigurationError`` with the user's ``text``."""
     try:
         return importlib.import_module(module)
-    except Exception as error:  # whatever its own code raises
+    except Exception as error:  # a user's module may raise any exception
         reason = f"{type(error).__name__}: {error}"
         raise ConfigurationError(
             f"{field} = {text!r} is not allowed: the module {module!r} cannot be imported "
@@ -60,11 +52,7 @@ def imported(field: str, text: str, module: str) -> ModuleType:
 
 
 def import_named(field: str, text: str) -> Any:
-    """The object that ``module:name`` stands for.
-
-    Raises:
-        ConfigurationError: no such text, no such module, or the module has no such name.
-    """
+    """Return the object of ``module:name``, or raise a ``ConfigurationError``."""
     module, _, name = text.partition(":")
     if not (name and all(part.isidentifier() for part in [*module.split("."), name])):
         raise ConfigurationError(f"{field} = {text!r} is not allowed: it must be 'module:name'")
@@ -77,11 +65,7 @@ def import_named(field: str, text: str) -> Any:
 
 
 def require(user: str, extra: str, *packages: str) -> None:
-    """Check that packages of an extra are installed.
-
-    Raises:
-        ConfigurationError: one is absent; names what needs it.
-    """
+    """Check that the packages of an extra are installed."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
             absent = f"{user} needs {package}, which is absent"
@@ -89,6 +73,6 @@ def require(user: str, extra: str, *packages: str) -> None:
 
 
 def name_of(value: Any) -> str:
-    """What :func:`import_named` would take for a function, as far as it has a name."""
+    """Return the ``module:name`` of a function, or else its ``repr``."""
     owner, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
     return f"{owner}:{name}" if owner and name else repr(value)

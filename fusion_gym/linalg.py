@@ -2,20 +2,19 @@
 
 A quantity of shape S for N runs is an array of shape ``(*S, N)``: a matrix is
 ``(..., n, m, N)`` and a vector ``(..., n, N)``. Leading axes (for example sensors) and a
-batch axis of length 1 broadcast as in NumPy, so a constant matrix is kept as ``(n, m, 1)``.
+batch axis of length 1 broadcast as in NumPy, so a constant matrix has the shape ``(n, m, 1)``.
 
-Every routine is a short sequence of element-wise NumPy operations written out along the two
-small axes; products and inverses of large matrices are BLAS's and LAPACK's, lane by lane. Each lane
-therefore sees exactly the same floating-point operations whatever the number of lanes, and a lane's
-result is bitwise the same alone and in a batch.
+Every routine is a short sequence of element-wise NumPy operations along the two small axes; BLAS
+and LAPACK compute products and inverses of large matrices, run by run. The floating-point
+operations of a run do not depend on the number of runs, so its result is bitwise the same in every
+batch.
 
 The routines for symmetric positive definite matrices (`cholesky`, `solve`, `solve_vector`,
 `inverse`) read only the diagonal and the lower triangle. They first
 scale rows and columns by ``1 / sqrt(diagonal)``, which gives a unit diagonal: the accuracy then
 depends on the conditioning of the correlation matrix and not on the units of the components,
-and diagonal entries from 1e-200 to 1e200 neither overflow nor underflow. A lane whose matrix is
-not positive definite comes back filled with NaN; the other lanes are unaffected, nothing is
-raised and no NumPy warning is issued.
+and diagonal entries from 1e-200 to 1e200 neither overflow nor underflow. A run whose matrix is
+not positive definite is NaN; other runs are unaffected, and there is no error and no warning.
 """
 
 from collections.abc import Callable
@@ -25,29 +24,29 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpstrf
 
 FloatArray = NDArray[np.float64]
-_MANY = 8  # rows from which on it is worth to look whether a matrix is diagonal
+_MANY = 8  # rows from which on a test for a diagonal matrix saves time
 _LARGE = 16  # rows from which on BLAS and LAPACK are faster than element-wise operations
-_ROUNDING = 2e-15  # relative, of a variance that is a difference, for each row
-_CHUNK = 32  # lanes that are transposed at a time and so stay in the cache
+_ROUNDING = 2e-15  # relative rounding error of a difference of variances, per row
+_CHUNK = 32  # runs per transposition, which then stays in the cache
 
 
 def identity(size: int) -> FloatArray:
-    """Identity matrix of shape ``(size, size, 1)``, broadcasting over the batch."""
+    """Return the identity matrix of shape ``(size, size, 1)``."""
     return np.eye(size)[:, :, None]
 
 
 def transpose(a: FloatArray) -> FloatArray:
-    """Matrix transpose: ``(..., n, m, N)`` to ``(..., m, n, N)``, a view of `a`."""
+    """Return the transpose ``(..., m, n, N)`` of ``(..., n, m, N)``, a view."""
     return a.swapaxes(-3, -2)
 
 
 def diagonal(a: FloatArray) -> FloatArray:
-    """Diagonal of square matrices: ``(..., n, n, N)`` to ``(..., n, N)``, a read-only view."""
+    """Return the diagonal ``(..., n, N)`` of ``(..., n, n, N)``, a read-only view."""
     return a.diagonal(0, -3, -2).swapaxes(-1, -2)
 
 
 def trace(a: FloatArray) -> FloatArray:
-    """Sum of the diagonal: ``(..., n, n, N)`` to ``(..., N)``."""
+    """Return the trace ``(..., N)`` of ``(..., n, n, N)``."""
     total = a[..., 0, 0, :].copy()
     for k in range(1, a.shape[-2]):
         total += a[..., k, k, :]
@@ -55,7 +54,7 @@ def trace(a: FloatArray) -> FloatArray:
 
 
 def weighted_trace(a: FloatArray, weights: FloatArray) -> FloatArray:
-    """Sum of the diagonal's entries times ``weights`` (n,): ``(..., n, n, N)`` to ``(..., N)``."""
+    """Return Σ w_i a_ii, ``(..., N)``, of ``(..., n, n, N)`` and ``weights`` w (n,)."""
     total = weights[0] * a[..., 0, 0, :]
     for k in range(1, a.shape[-2]):
         total += weights[k] * a[..., k, k, :]
@@ -63,7 +62,7 @@ def weighted_trace(a: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
-    """``a + diag(d)``: ``(..., n, n, N)`` and d broadcastable to ``(..., n, N)``, a new array."""
+    """Return ``a + diag(d)`` of ``(..., n, n, N)`` and d broadcastable to ``(..., n, N)``."""
     result = a.copy()
     for k in range(a.shape[-2]):
         result[..., k, k, :] += d[..., k, :]
@@ -71,7 +70,7 @@ def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
 
 
 def symmetrise(a: FloatArray) -> FloatArray:
-    """Symmetric part ``(a + a^T) / 2`` of ``(..., n, n, N)``, exactly symmetric, a new array."""
+    """Return the symmetric part ``(a + a^T) / 2`` of ``(..., n, n, N)``, exactly symmetric."""
     result = a + a.swapaxes(-3, -2)
     result *= 0.5
     return result
@@ -85,13 +84,17 @@ def _require_equal_lengths(operation: str, left: int, right: int) -> None:
 
 
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Matrix product: ``(..., n, k, N)`` times ``(..., k, m, N)`` to ``(..., n, m, N)``.
+    """Return the matrix product ``(..., n, m, N)``.
 
-    Accumulated over k in ascending order, in ``2 k - 1`` array operations; by BLAS where all three
-    axes are large.
+    The sum over k is accumulated in ascending order in ``2 k - 1`` array operations, or by BLAS
+    where all three axes are large.
+
+    Args:
+        a: ``(..., n, k, N)``.
+        b: ``(..., k, m, N)``.
 
     Raises:
-        ValueError: the two axes of length k differ.
+        ValueError: The two axes of length k differ.
     """
     length = a.shape[-2]
     _require_equal_lengths("matmul", length, b.shape[-3])
@@ -104,7 +107,7 @@ def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _by_lane(function: Callable[..., FloatArray], *matrices: FloatArray) -> FloatArray:
-    """Apply a function of stacks ``(..., lanes, n, m)``, which takes the lanes one by one."""
+    """Apply a function of stacks ``(..., N, n, m)`` that treats each run separately."""
     lanes = max(matrix.shape[-1] for matrix in matrices)
     parts = []
     for first in range(0, lanes, _CHUNK):
@@ -116,11 +119,11 @@ def _by_lane(function: Callable[..., FloatArray], *matrices: FloatArray) -> Floa
 
 
 def _inverse_of_stack(stack: FloatArray) -> FloatArray:
-    """Inverses of a stack ``(..., n, n)`` by LAPACK; NaN where a matrix has no Cholesky factor."""
+    """Return inverses of a stack ``(..., n, n)`` by LAPACK, NaN where Cholesky's method fails."""
     size = stack.shape[-1]
     lower = np.empty((stack.size // size**2, size, size))
     for matrix, result in zip(stack.reshape(lower.shape), lower, strict=True):
-        factor, failed = dpotrf(matrix.T)  # the upper triangle of a matrix that is kept by columns
+        factor, failed = dpotrf(matrix.T)  # upper triangle in column-major order
         result[:] = np.nan if failed else dpotri(factor)[0].T
     whole: FloatArray = lower + lower.swapaxes(-1, -2)
     whole[:, range(size), range(size)] *= 0.5
@@ -128,11 +131,7 @@ def _inverse_of_stack(stack: FloatArray) -> FloatArray:
 
 
 def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
-    """Matrix times vector: ``(..., n, k, N)`` times ``(..., k, N)`` to ``(..., n, N)``.
-
-    Raises:
-        ValueError: the two axes of length k differ.
-    """
+    """Return the product ``a v``, ``(..., n, N)``, of ``(..., n, k, N)`` and ``(..., k, N)``."""
     length = a.shape[-2]
     _require_equal_lengths("matvec", length, v.shape[-2])
     if min(a.shape[-3], length) >= _LARGE:
@@ -144,16 +143,12 @@ def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def outer(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Outer product ``u v^T``: ``(..., n, N)`` and ``(..., m, N)`` to ``(..., n, m, N)``."""
+    """Return ``u v^T``, ``(..., n, m, N)``, of ``(..., n, N)`` and ``(..., m, N)``."""
     return u[..., :, None, :] * v[..., None, :, :]
 
 
 def dot(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Inner product ``u^T v``: ``(..., n, N)`` and ``(..., n, N)`` to ``(..., N)``.
-
-    Raises:
-        ValueError: the two axes of length n differ.
-    """
+    """Return the inner product ``u^T v``, ``(..., N)``, of two vectors ``(..., n, N)``."""
     length = u.shape[-2]
     _require_equal_lengths("dot", length, v.shape[-2])
     result: FloatArray = u[..., 0, :] * v[..., 0, :]
@@ -163,49 +158,48 @@ def dot(u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def quadratic(v: FloatArray, a: FloatArray) -> FloatArray:
-    """Quadratic form ``v^T a v``: ``(..., n, N)`` and ``(..., n, n, N)`` to ``(..., N)``.
-
-    Raises:
-        ValueError: the sizes of `v` and `a` differ.
-    """
+    """Return ``v^T a v``, ``(..., N)``, of ``(..., n, N)`` and ``(..., n, n, N)``."""
     return dot(v, matvec(a, v))
 
 
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
-    """Congruence ``a p a^T`` for symmetric `p`, made exactly symmetric.
+    """Return the congruence ``a p a^T`` for symmetric `p`, exactly symmetric.
 
     Args:
         a: ``(..., m, n, N)``.
         p: ``(..., n, n, N)``, symmetric (not checked).
 
     Returns:
-        ``(..., m, m, N)``. The symmetric part of the computed product is returned, which costs
-        two array operations and keeps repeated covariance updates from drifting.
+        The symmetric part ``(..., m, m, N)`` of the computed product, so that repeated covariance
+        updates do not drift.
 
     Raises:
-        ValueError: the sizes of `a` and `p` differ.
+        ValueError: The sizes of `a` and `p` differ.
     """
     product = matmul(matmul(a, p), a.swapaxes(-3, -2))
     return product if product.shape[-2] == 1 else symmetrise(product)
 
 
 def gram(f: FloatArray) -> FloatArray:
-    """``f f^T`` of ``(..., n, k, N)``, exactly symmetric: ``(..., n, n, N)``."""
+    """Return ``f f^T``, ``(..., n, n, N)``, of ``(..., n, k, N)``, exactly symmetric."""
     return matmul(f, f.swapaxes(-3, -2))
 
 
 def _inverse_root(x: FloatArray) -> FloatArray:
-    """``1 / sqrt(x)`` for positive x and NaN for zero, negative or infinite x."""
+    """Return ``1 / sqrt(x)`` for positive x and NaN for zero, negative or infinite x."""
     root: FloatArray = np.sqrt(x)
     root /= x
     return root
 
 
 def _pair_scales(a: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Closed form for 2x2: the correlation ``(..., N)`` and scales ``(..., 2, N)``.
+    """Return the correlation r (..., N) and the scales w (..., 2, N) of 2x2 matrices.
 
-    With r the correlation and w_i = 1 / sqrt(a_ii (1 - r^2)), the inverse of `a` is
-    [[w_0^2, -r w_0 w_1], [-r w_0 w_1, w_1^2]]; the determinant itself is never formed.
+    With w_i = 1 / sqrt(a_ii (1 - r^2)), the inverse of `a` is
+    [[w_0^2, -r w_0 w_1], [-r w_0 w_1, w_1^2]], without the determinant.
+
+    Args:
+        a: ``(..., 2, 2, N)``.
     """
     scale = _inverse_root(diagonal(a))
     correlation: FloatArray = a[..., 1, 0, :] * scale[..., 0, :]
@@ -216,7 +210,7 @@ def _pair_scales(a: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _equilibrate(a: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Correlation matrix ``(..., n, n, N)`` and the scales 1 / sqrt(a_ii) ``(..., n, N)``."""
+    """Return correlations ``(..., n, n, N)`` and scales 1 / sqrt(a_ii) ``(..., n, N)``."""
     scale = _inverse_root(diagonal(a))
     correlation: FloatArray = a * scale[..., :, None, :]
     correlation *= scale[..., None, :, :]
@@ -224,14 +218,17 @@ def _equilibrate(a: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _eliminate(work: FloatArray, right: FloatArray | None) -> FloatArray:
-    """Cholesky factorisation in place by columns, with an optional forward substitution.
+    """Factorise in place by Cholesky's method, with an optional forward substitution.
 
-    On return the lower triangle of `work` ``(..., n, n, N)`` holds the factor L, except that its
-    diagonal holds 1 / L_kk, and `right` ``(..., n, m, N)`` holds L^-1 times what it held before.
-    A pivot which is not positive makes its own column and every later one NaN.
+    The lower triangle of `work` becomes the factor L, with 1 / L_kk on its diagonal, and `right`
+    becomes L^-1 `right`. A pivot that is not positive makes its own column and every later one NaN.
+
+    Args:
+        work: ``(..., n, n, N)``.
+        right: ``(..., n, m, N)`` or ``None``.
 
     Returns:
-        The last inverse pivot, ``(..., N)``, which is NaN exactly where factorisation failed.
+        The last inverse pivot ``(..., N)``, which is NaN exactly where the factorisation fails.
     """
     size = work.shape[-2]
     for k in range(size):
@@ -251,14 +248,14 @@ def _eliminate(work: FloatArray, right: FloatArray | None) -> FloatArray:
 
 @np.errstate(all="ignore")
 def cholesky(a: FloatArray) -> FloatArray:
-    """Lower Cholesky factor: ``(..., n, n, N)`` to lower triangular L with ``L L^T = a``.
+    """Return the lower Cholesky factor L with ``L L^T = a``.
 
     Args:
-        a: symmetric positive definite; only the lower triangle is read.
+        a: ``(..., n, n, N)``, symmetric positive definite; only the lower triangle is read.
 
     Returns:
-        ``(..., n, n, N)`` with a positive diagonal and zeros above it. Every entry of a lane
-        that is not positive definite is NaN.
+        ``(..., n, n, N)`` with a positive diagonal and zeros above it, all NaN in a run whose
+        matrix is not positive definite.
     """
     work, scale = _equilibrate(a)
     last = _eliminate(work, None)
@@ -274,7 +271,7 @@ def cholesky(a: FloatArray) -> FloatArray:
 
 @np.errstate(all="ignore")
 def whiten(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``L^-1 b`` (..., n, m, N) with L the Cholesky factor of `a`, as :func:`cholesky` reads it."""
+    """Return ``L^-1 b`` (..., n, m, N) with L the Cholesky factor of `a`."""
     work, scale = _equilibrate(a)
     x: FloatArray = b * scale[..., :, None, :]
     _eliminate(work, x)
@@ -283,10 +280,13 @@ def whiten(a: FloatArray, b: FloatArray) -> FloatArray:
 
 @np.errstate(all="ignore")
 def root(a: FloatArray) -> FloatArray:
-    """Some F with ``F F^T = a``, ``(..., n, n, N)``, of any symmetric positive semi-definite `a`.
+    """Return a root F with ``F F^T = a`` of a positive semi-definite matrix.
 
-    A Cholesky factorisation of the correlations with complete pivoting. A direction whose variance
-    is the rounding of the others' gets none, and with D diagonal the root of ``D a D`` is ``D F``.
+    It is a Cholesky factorisation of the correlations with complete pivoting. A direction whose
+    variance is only rounding error gets zero. The root of ``D a D`` with D diagonal is ``D F``.
+
+    Args:
+        a: ``(..., n, n, N)``, symmetric positive semi-definite.
     """
     size = a.shape[-2]
     scale = np.sqrt(np.maximum(diagonal(a), 0.0))
@@ -304,7 +304,7 @@ def root(a: FloatArray) -> FloatArray:
         result[..., 1, 1, :] = scale[..., 1, :] * np.sqrt(left)
         return result
     rest = unit[..., :, None, :] * a * unit[..., None, :, :]
-    for k in range(size):  # exactly, for rounding must not decide which pivot is the first
+    for k in range(size):  # exact, so that rounding does not decide the first pivot
         rest[..., k, k, :] = np.where(scale[..., k, :] == 0.0, 0.0, 1.0)
     if size >= _LARGE:
         return scale[..., :, None, :] * _by_lane(_root_of_stack, rest)
@@ -320,7 +320,7 @@ def root(a: FloatArray) -> FloatArray:
 
 
 def _root_of_stack(stack: FloatArray) -> FloatArray:
-    """Roots of a stack ``(..., n, n)`` by LAPACK's pivoted Cholesky factorisation."""
+    """Return roots of a stack ``(..., n, n)`` by LAPACK's pivoted Cholesky factorisation."""
     size = stack.shape[-1]
     result = np.zeros((stack.size // size**2, size, size))
     for matrix, lower in zip(stack.reshape(result.shape), result, strict=True):
@@ -331,7 +331,7 @@ def _root_of_stack(stack: FloatArray) -> FloatArray:
 
 
 def draw_normal(mean: FloatArray, covariance: FloatArray, normals: FloatArray) -> FloatArray:
-    """From N(mean, covariance): ``(..., n, N)`` of ``(..., n, n, N)`` and standard normals."""
+    """Return samples ``(..., n, N)`` of N(mean, covariance) from standard normals."""
     return mean + matvec(root(covariance), normals)
 
 
@@ -347,10 +347,10 @@ def solve(a: FloatArray, b: FloatArray) -> FloatArray:
         b: ``(..., n, m, N)``.
 
     Returns:
-        x ``(..., n, m, N)``, all NaN in a lane where `a` is not positive definite.
+        x ``(..., n, m, N)``, all NaN in a run where `a` is not positive definite.
 
     Raises:
-        ValueError: the sizes of `a` and `b` differ.
+        ValueError: The sizes of `a` and `b` differ.
     """
     size = a.shape[-2]
     _require_equal_lengths("solve", size, b.shape[-3])
@@ -378,18 +378,17 @@ def solve(a: FloatArray, b: FloatArray) -> FloatArray:
 def solve_vector(a: FloatArray, v: FloatArray) -> FloatArray:
     """Solve ``a x = v`` for symmetric positive definite `a` and one right-hand side.
 
-    Diagonal matrices of many rows, as independent states have, cost no elimination; the result is
-    bitwise that of :func:`solve`.
+    Large diagonal matrices need no elimination; the result is bitwise equal to :func:`solve`.
 
     Args:
         a: ``(..., n, n, N)``; only the lower triangle is read.
         v: ``(..., n, N)``.
 
     Returns:
-        x ``(..., n, N)``, all NaN in a lane where `a` is not positive definite.
+        x ``(..., n, N)``, all NaN in a run where `a` is not positive definite.
 
     Raises:
-        ValueError: the sizes of `a` and `v` differ.
+        ValueError: The sizes of `a` and `v` differ.
     """
     if a.shape[-2] >= _MANY and np.count_nonzero(a) == np.count_nonzero(diagonal(a)):
         return _solve_diagonal(diagonal(a), v)
@@ -398,7 +397,7 @@ def solve_vector(a: FloatArray, v: FloatArray) -> FloatArray:
 
 @np.errstate(all="ignore")
 def _solve_diagonal(d: FloatArray, v: FloatArray) -> FloatArray:
-    """``v / d`` of ``(..., n, N)``, with the roundings of :func:`solve`; NaN as there."""
+    """Return ``v / d`` of ``(..., n, N)``, with the rounding and the NaN of :func:`solve`."""
     scale = _inverse_root(d)
     pivot = _inverse_root(d * scale * scale)
     x: FloatArray = v * scale * pivot
@@ -408,16 +407,16 @@ def _solve_diagonal(d: FloatArray, v: FloatArray) -> FloatArray:
 
 @np.errstate(all="ignore")
 def inverse(a: FloatArray) -> FloatArray:
-    """Inverse of symmetric positive definite matrices, ``(..., n, n, N)`` to the same shape.
+    """Return the inverse of symmetric positive definite matrices, exactly symmetric.
 
-    Size 2 uses its closed form and larger ones ``L^-T L^-1`` with L the Cholesky factor, LAPACK's
-    for large ones; all give an exactly symmetric result.
+    Size 2 uses its closed form, larger ones ``L^-T L^-1`` with the Cholesky factor L, large ones
+    LAPACK.
 
     Args:
-        a: symmetric positive definite; only the lower triangle is read.
+        a: ``(..., n, n, N)``; only the lower triangle is read.
 
     Returns:
-        The inverse, all NaN in a lane where `a` is not positive definite.
+        The inverse, all NaN in a run where `a` is not positive definite.
     """
     size = a.shape[-2]
     if size == 1:
@@ -432,7 +431,7 @@ def inverse(a: FloatArray) -> FloatArray:
     work, scale = _equilibrate(a)
     if size >= _LARGE:
         return _by_lane(_inverse_of_stack, work) * outer(scale, scale)
-    # Rows n and up turn from the scales into diag(scale) L^-T, which is upper triangular.
+    # Rows from n on become the upper triangular diag(scale) L^-T.
     stack = np.zeros((*a.shape[:-3], 2 * size, size, a.shape[-1]))
     stack[..., :size, :, :] = work
     for k in range(size):

@@ -1,7 +1,7 @@
-"""Checks of what a user hands in: one clear error, with the field, its value and what is allowed.
+"""Checks of user input; an error names the field, its value and the allowed values.
 
-Every check returns the value in the form the library works with (float64 arrays, Python ints)
-and raises :class:`ConfigurationError` otherwise.
+Every check returns the value in the library's form (float64 arrays, Python ints) or raises a
+:class:`ConfigurationError`.
 """
 
 import copy
@@ -15,31 +15,28 @@ from numpy.typing import ArrayLike
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, UnexpectedArgumentError, display, nearest, refusal
 
-# Filters square what they are given and divide by it: from here to there float64 can hold that.
+# Range of numbers whose squares and reciprocals float64 represents.
 SMALLEST, LARGEST = 1e-15, 1e15
 LONGEST = 100  # entries of an axis of any length; matrices are multiplied entry by entry
-MOST_SENSORS = 1000  # the network serves them in a loop
+MOST_SENSORS = 1000  # the network loops over them
 MOST_RUNS = 1_000_000  # each has a generator and a block of noise
-MOST_STEPS = 1000  # ahead, of a policy that plans
-MOST_PERIOD = 10**9  # of a policy that requests by the clock
+MOST_STEPS = 1000  # horizon of a planning policy
+MOST_PERIOD = 10**9  # of a periodic policy
 DEEPEST, MOST_ENTRIES = 32, 100_000  # of nested values
 LONGEST_TEXT, LONGEST_YAML = 100_000_000, 1_000_000  # characters of a file
-CONTROL = r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"  # in no name, path or word
-LONGEST_HORIZON = 50_000  # scales and tables are worked out step by step
+CONTROL = r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"  # not allowed in names, paths and words
+LONGEST_HORIZON = 50_000  # scales and tables need one computation per step
 
 
 def _numbers(field: str, value: ArrayLike, allowed: str) -> Array:
-    """The value as a float64 array; text, booleans, complex numbers and ragged lists are none.
-
-    Infinity and what is no number are left to the caller.
-    """
+    """Return the value as a float64 array, possibly with infinities and NaN."""
     try:
         values = np.asarray(value)
     except ValueError:
         raise refusal(field, value, allowed) from None
     if values.dtype.kind not in "iuf":
         raise refusal(field, value, allowed)
-    with np.errstate(over="ignore"):  # a longer kind of float than float64
+    with np.errstate(over="ignore"):  # for floats longer than float64
         result = np.array(values, dtype=np.float64)
     if np.any((np.abs(result) > LARGEST) & np.isfinite(result)):
         raise refusal(field, value, f"at most {LARGEST:g} in magnitude")
@@ -49,11 +46,7 @@ def _numbers(field: str, value: ArrayLike, allowed: str) -> Array:
 def array(
     field: str, value: ArrayLike, shape: tuple[int | None, ...], longest: int = LONGEST
 ) -> Array:
-    """A finite float64 array of this shape; ``None`` in it is any length from 1 to ``longest``.
-
-    Raises:
-        ConfigurationError: not numeric, not finite, or of another shape.
-    """
+    """Return a finite float64 array of this shape; ``None`` is any length from 1 to ``longest``."""
     result = _numbers(field, value, "an array of numbers")
     required = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     matches = len(shape) == result.ndim and all(
@@ -69,23 +62,13 @@ def array(
 
 
 def square(field: str, value: ArrayLike) -> Array:
-    """A finite square matrix of float64.
-
-    Raises:
-        ConfigurationError: not numeric, not finite, or not square.
-    """
+    """Return a finite square matrix of float64."""
     size = len(array(field, value, (None, None)))
     return array(field, value, (size, size))
 
 
 def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: int = 0) -> Array:
-    """Like :func:`array`, but a value that broadcasts to ``shape`` (one number for all) will do.
-
-    ``infinity`` of 1 or -1 allows infinity of that sign as well.
-
-    Raises:
-        ConfigurationError: not numeric, not finite, or not broadcastable to ``shape``.
-    """
+    """Return a finite array broadcast to ``shape``, or with infinities of the sign ``infinity``."""
     allowed = f"a number or an array of shape {shape}"
     values = _numbers(field, value, allowed)
     try:
@@ -107,11 +90,7 @@ def number(
     at_least: float | None = None,
     at_most: float | None = None,
 ) -> float:
-    """A finite real number within the stated limits.
-
-    Raises:
-        ConfigurationError: not a number, not finite, or outside the limits.
-    """
+    """Return a finite real number within the limits."""
     limits = {">": above, ">=": at_least, "<=": at_most}
     listed = " and ".join(f"{sign} {limit}" for sign, limit in limits.items() if limit is not None)
     allowed = f"a finite number {listed}".rstrip()
@@ -137,11 +116,7 @@ def number(
 
 
 def integer(field: str, value: Any, *, at_least: int, at_most: int | None = None) -> int:
-    """A whole number within the stated limits (``True``, 2.0 and "2" are not whole numbers).
-
-    Raises:
-        ConfigurationError: not an integer or outside the limits.
-    """
+    """Return a whole number within the limits; ``True``, 2.0 and "2" are not allowed."""
     allowed = f"a whole number >= {at_least}" + ("" if at_most is None else f" and <= {at_most}")
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise refusal(field, value, allowed)
@@ -151,11 +126,7 @@ def integer(field: str, value: Any, *, at_least: int, at_most: int | None = None
 
 
 def nested(field: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield a value and all that lists and mappings within it hold, each with the key above it.
-
-    Raises:
-        ConfigurationError: too deep, as what holds itself, or too large.
-    """
+    """Yield a value and all entries of its nested lists and mappings, each with its key."""
     left, count = [(field, value, 0)], 0
     while left:
         key, part, depth = left.pop()
@@ -171,11 +142,7 @@ def nested(field: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def limit_options(value: Mapping[str, Any]) -> None:
-    """Check that options are neither deep nor large, and can be copied.
-
-    Raises:
-        ConfigurationError: one is not; names it.
-    """
+    """Check that options are not too deep or large, and can be copied."""
     for name, entry in value.items():
         for _ in nested(name, entry):
             pass
@@ -186,11 +153,7 @@ def limit_options(value: Mapping[str, Any]) -> None:
 
 
 def read_text(field: str, path: Path, name: str | None = None) -> str:
-    """Return a file's text; ``name`` is what the user calls it, if that is not its path.
-
-    Raises:
-        ConfigurationError: it cannot be read, or is no text in UTF-8.
-    """
+    """Return the UTF-8 text of a file; ``name`` replaces the path in an error message."""
     label = str(path) if name is None else name
     try:
         with path.open(encoding="utf-8") as file:
@@ -200,28 +163,20 @@ def read_text(field: str, path: Path, name: str | None = None) -> str:
         return text
     except UnicodeDecodeError as error:
         raise ConfigurationError(f"{field} = {label!r} is no text in UTF-8: {error}") from None
-    except (OSError, ValueError) as error:  # a ValueError of a path that no system knows
+    except (OSError, ValueError) as error:  # an invalid path raises a ValueError
         reason = getattr(error, "strerror", None) or error
         raise ConfigurationError(f"{field} = {label!r} cannot be read: {reason}") from None
 
 
 def boolean(field: str, value: Any) -> bool:
-    """``True`` or ``False``.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Return ``True`` or ``False``."""
     if not isinstance(value, (bool, np.bool_)):
         raise refusal(field, value, "True or False")
     return bool(value)
 
 
 def choice(field: str, value: Any, options: Iterable[str]) -> str:
-    """One of the named options.
-
-    Raises:
-        ConfigurationError: not among them; the message lists them and the nearest match.
-    """
+    """Return a value that is one of ``options``; an error suggests the nearest option."""
     names = list(options)
     if isinstance(value, str) and value in names:
         return value
@@ -231,11 +186,7 @@ def choice(field: str, value: Any, options: Iterable[str]) -> str:
 
 
 def keys(kind: str, value: Iterable[str], known: Iterable[str]) -> None:
-    """Every given key is known.
-
-    Raises:
-        ConfigurationError: names the first unknown key, the nearest match and all known keys.
-    """
+    """Check that every key is known; an error suggests the nearest known key."""
     names = sorted(known)
     for key in value:
         if key not in names:
@@ -243,22 +194,14 @@ def keys(kind: str, value: Iterable[str], known: Iterable[str]) -> None:
 
 
 def reset_options(value: Any, known: Iterable[str]) -> None:
-    """The options of a reset are a mapping, or None, and every key is known.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Check that the options of a reset are ``None`` or a mapping with known keys."""
     if value is not None and not isinstance(value, Mapping):
         raise refusal("options", value, "a dictionary of reset options, or None")
     keys("reset option", value or {}, known)
 
 
 def arguments(owner: str, value: Iterable[str], known: Iterable[str]) -> None:
-    """Every given keyword argument is one that ``owner`` takes.
-
-    Raises:
-        UnexpectedArgumentError: names the first that is not, the nearest match and all known ones.
-    """
+    """Raise an ``UnexpectedArgumentError`` if ``owner`` does not take a keyword argument."""
     names = sorted(known)
     for key in value:
         if key not in names:
@@ -274,11 +217,7 @@ def _known(key: Any, names: list[str]) -> str:
 
 
 def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
-    """A symmetric positive semi-definite (or, on demand, definite) matrix of shape (size, size).
-
-    Raises:
-        ConfigurationError: another shape, not symmetric, or a negative (zero) eigenvalue.
-    """
+    """Return a symmetric positive (semi-)definite matrix of shape (size, size)."""
     matrix = array(field, value, (size, size))
     if not np.allclose(matrix, matrix.T, rtol=1e-10, atol=1e-14):
         raise refusal(field, matrix, "symmetric")
@@ -296,11 +235,7 @@ def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = Fals
 
 
 def positive(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """A number or array, broadcast to ``shape``, of entries > 0.
-
-    Raises:
-        ConfigurationError: not numeric, another shape, or an entry <= 0.
-    """
+    """Return an array broadcast to ``shape`` with entries > 0."""
     result = spread(field, value, shape)
     if np.any(result <= 0):
         raise refusal(field, value, "> 0 everywhere")
@@ -310,11 +245,7 @@ def positive(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def not_negative(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """A number or array, broadcast to ``shape``, of entries >= 0.
-
-    Raises:
-        ConfigurationError: not numeric, another shape, or a negative entry.
-    """
+    """Return an array broadcast to ``shape`` with entries >= 0."""
     result = spread(field, value, shape)
     if np.any(result < 0):
         raise refusal(field, value, ">= 0 everywhere")
@@ -322,36 +253,31 @@ def not_negative(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def horizon(value: Any) -> int:
-    """The steps of an episode, from 1 to 50,000.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Return the steps of an episode, from 1 to 50,000."""
     return integer("horizon", value, at_least=1, at_most=LONGEST_HORIZON)
 
 
 def runs(value: Any) -> int:
-    """The runs of a vector environment, from 1 to a million.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Return the number of runs of a vector environment, from 1 to a million."""
     return integer("num_envs", value, at_least=1, at_most=MOST_RUNS)
 
 
 def one_or_each(value: ArrayLike) -> tuple[int, ...]:
-    """The shape of a parameter that is one number for all sensors, (), or one for each, (l,)."""
+    """Return the shape of a parameter: () for one number, (l,) for one per sensor."""
     values = np.asarray(value)
     return values.shape if values.ndim == 1 else ()
 
 
 def adaptive_thresholds(rho_bar: ArrayLike, rho_initial: ArrayLike, adaptation: ArrayLike) -> None:
-    """0 <= ρ₀ <= ρ̄ <= 1 and λ > 0, each one number or one a sensor.
+    """Check 0 <= ρ₀ <= ρ̄ <= 1 and λ > 0 of unknown_input, equations (5)-(7).
+
+    Args:
+        rho_bar: ρ̄, one number or one per sensor.
+        rho_initial: ρ₀, one number or one per sensor.
+        adaptation: λ, one number or one per sensor.
 
     Raises:
-        ConfigurationError: anything else.
-
-    Source: unknown_input, equations (5)-(7).
+        ConfigurationError: A number is outside its limits.
     """
     limit = not_negative("rho_bar", rho_bar, one_or_each(rho_bar))
     if np.any(limit > 1.0):

@@ -1,4 +1,4 @@
-"""YAML as it is read here: plain values alone, no key given twice, and limits of size."""
+"""A YAML reader with plain values, unique keys and limits of size."""
 
 import re
 from collections.abc import Hashable
@@ -10,8 +10,8 @@ from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.importing import refuse_code
 from fusion_gym.validation import CONTROL, LONGEST_YAML, MOST_ENTRIES, nested
 
-_CONTROL = re.compile(rf"(?![\t\n]){CONTROL}")  # texts have lines
-_NUMBERS = {  # without the sexagesimal 1:30 and the octal 010 of YAML 1.1, and with 1e-3
+_CONTROL = re.compile(rf"(?![\t\n]){CONTROL}")  # line breaks and tabs are allowed
+_NUMBERS = {  # YAML 1.2: without sexagesimal 1:30 and octal 010, with 1e-3
     "int": r"[-+]?(0|[1-9][\d_]*|0x[\da-fA-F_]+|0b[01_]+)$",
     "float": r"[-+]?((\d[\d_]*\.[\d_]*|\.\d[\d_]*)([eE][-+]?\d+)?|\d+[eE][-+]?\d+)$"
     r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$",
@@ -27,21 +27,13 @@ class _Loader(yaml.SafeLoader):
     }
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Merge what ``<<`` names.
-
-        Raises:
-            ConstructorError: that is too large.
-        """
+        """Merge the mappings of ``<<``, up to ``MOST_ENTRIES`` entries."""
         super().flatten_mapping(node)
         if len(node.value) > MOST_ENTRIES:
             raise _problem("it merges too many entries", node)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """A mapping.
-
-        Raises:
-            ConstructorError: a key that is given twice.
-        """
+        """Return a mapping, or raise a ``ConstructorError`` for a duplicate key."""
         visited = set()
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
@@ -64,16 +56,12 @@ for _kind, _pattern in _NUMBERS.items():
 
 
 def parsed(text: str, source: str) -> Any:
-    """What a text in YAML holds; ``source`` says in an error where it is from.
-
-    Raises:
-        ConfigurationError: it is no YAML, or names code.
-    """
+    """Return the content of a YAML text; ``source`` is its name in an error message."""
     try:
         if len(text) > LONGEST_YAML:
             raise ValueError(f"it has more than {LONGEST_YAML:,} characters")
         result = yaml.load(text, _Loader)  # a safe loader
-    # PyYAML lets through what its types raise: a date of 31 February, tags without a value.
+    # PyYAML's types raise other errors, such as for a date of 31 February.
     except (yaml.YAMLError, ValueError, AttributeError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigurationError(f"{source} is no YAML: {reason}") from None

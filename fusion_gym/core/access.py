@@ -1,4 +1,4 @@
-"""Medium access: which sensors may use the network in a step, before tokens are asked for."""
+"""Medium access: the sensors that may use the network in a step, before tokens are spent."""
 
 from typing import get_args
 
@@ -15,12 +15,15 @@ ACCESS_RULES: tuple[str, ...] = get_args(AccessRule)
 def access_mask(
     rule: str, sensors: int, step: NDArray[np.int64], noise: Array | None
 ) -> NDArray[np.bool_]:
-    """Which sensors (sensors, N) the network admits at ``step`` (N,), the steps taken so far.
+    """Return the sensors (sensors, N) bool that the network admits in a step.
 
-    - ``"any"``: all of them.
-    - ``"single"``: all of them, but only one request a step gets through (:func:`first_request`).
-    - ``"round_robin"``: one after another, sensor 0 first (round_robin_tobit, equation (4)).
-    - ``"random"``: one, drawn from the standard normals ``noise`` (N,).
+    Args:
+        rule: ``"any"`` and ``"single"`` admit all sensors; ``"single"`` then grants one request
+            (:func:`first_request`). ``"round_robin"`` admits sensor ``step % sensors``
+            (round_robin_tobit, equation (4)), ``"random"`` a random one.
+        sensors: Number of sensors.
+        step: Steps taken so far (N,).
+        noise: Standard normals (N,) for ``"random"``.
     """
     if rule == "round_robin":
         turn = step % sensors

@@ -1,4 +1,4 @@
-"""How much of a system float64 holds over an episode: by its moments before, its numbers in it."""
+"""The limits of float64 over an episode: a check of moments before it, and of values during it."""
 
 import warnings
 from bisect import bisect_left
@@ -12,23 +12,24 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.system import System
 from fusion_gym.errors import ConfigurationError, DivergenceError
 
-LARGEST_ERROR = 1e32  # of squares on average: rewards are also handed on as float32
-# Means, in deviations, and variances that are right to the first need no warning; of more than the
-# second nothing reliable is left.
+LARGEST_ERROR = 1e32  # mean square; rewards become float32
+# Relative errors above the first value give a warning, above the second an error.
 _RIGHT, _WRONG = 1e-9, 0.2
-# Of float64's precision times a ratio of `System.rounding`, by comparison with 50 digits.
+# Factors of the ratios of `System.rounding`, fitted to 50-digit computations.
 _OF_SIGNAL, _OF_LOSS = 2.0, 0.13
 _PRECISION = float(np.finfo(np.float64).eps)
 
 
 def admit(system: System[Any], horizon: int) -> Array:
-    """Return the error variances (n,) of a centre that never receives, of a system that fits.
+    """Return the open-loop error variances (n,) of a system that float64 can simulate.
 
-    Warn where estimates are less accurate than 1e-9, with the accuracy that is left.
+    Args:
+        system: The system; an accuracy of its estimates below 1e-9 gives a warning.
+        horizon: Steps of an episode.
 
     Raises:
-        ConfigurationError: over the horizon they grow beyond all bounds, or states so far beyond
-            their noise that nothing is left of its digits; names the longest horizon that fits.
+        ConfigurationError: The variances exceed ``LARGEST_ERROR``, or rounding errors exceed 20 %.
+            The message has the longest horizon that is allowed.
     """
     open_loop = system.open_loop(horizon)
     accuracy = _accuracy(system, horizon)
@@ -51,7 +52,7 @@ def admit(system: System[Any], horizon: int) -> Array:
         f"variance (here {signal:.3g}), and variances of which a packet leaves one part in "
         f"{variances:.0e} (here in {variance:.3g})"
     )
-    # What is lost rises with the horizon.
+    # The loss of accuracy grows with the horizon.
     longest = bisect_left(
         range(1, horizon), True, key=lambda steps: not _accuracy(system, steps) <= _WRONG
     )
@@ -64,10 +65,7 @@ def admit(system: System[Any], horizon: int) -> Array:
 
 
 def _accuracy(system: System[Any], horizon: int) -> float:
-    """Estimate the largest error of means, in deviations, and of variances, over their size.
-
-    It may be ten times as large, after a long silence, and is often a hundred times smaller.
-    """
+    """Estimate the largest relative rounding error of means (in deviations) and variances."""
     if not system.open_loop(horizon).max() <= LARGEST_ERROR:
         return np.inf
     signal, loss = system.rounding(horizon)
@@ -77,11 +75,7 @@ def _accuracy(system: System[Any], horizon: int) -> float:
 def require_finite(
     values: Mapping[str, Array], finished: NDArray[np.bool_], steps: NDArray[np.int64]
 ) -> None:
-    """Pass by values (…, N) of N runs that are finite wherever a run is not ``finished``.
-
-    Raises:
-        DivergenceError: names the first run with one that is not, its step and the quantity.
-    """
+    """Raise a ``DivergenceError`` if a value (…, N) of an unfinished run is not finite."""
     for name, value in values.items():
         lost = ~np.isfinite(value).reshape(-1, len(steps)).all(0) & ~finished
         if lost.any():

@@ -1,4 +1,4 @@
-"""What a step would have brought, had other requests been made on the same noise."""
+"""The outcomes of a step for alternative requests on the same noise."""
 
 from typing import NamedTuple
 
@@ -9,15 +9,17 @@ from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.runs import Branch, Outcome
 
-_MOST_BITS = 62  # of a whole number that holds the sensors' grants and the run
+_MOST_BITS = 62  # of an integer that encodes grants and run
 
 
 class Alternatives(NamedTuple):
-    """A steps that could have been taken in each of N runs.
+    """The outcomes of A alternative decisions in each of N runs.
 
-    ``error`` (n, A, N) of the fused estimate, ``communication`` (A, N) the cost's term of the
-    reward, ``observation`` (A, N, entries) float32 of the state that follows. Of an episode that
-    has ended it is the state with which it would have gone on.
+    Attributes:
+        error: Truth minus fused estimate (n, A, N).
+        communication: Token term of the reward (A, N).
+        observation: (A, N, entries) float32 of the next state, which for an ended episode is the
+            state without a reset.
     """
 
     error: Array
@@ -33,15 +35,18 @@ def alternatives(
     observation: NDArray[np.float32],
     beliefs: Beliefs,
 ) -> Alternatives:
-    """What each of the requests (A, sensors, N) would have brought to the runs of ``before``.
+    """Return the outcomes of alternative requests; equal grants share one simulated step.
 
-    On the standard normals (channels, N) on which the step was ``taken`` that led to what is
-    observed, (N, entries), and to these ``beliefs``.
-    Requests that the network would have answered alike are stepped once, those that it would have
-    answered as in the step taken not at all. Nothing that is given moves.
+    Args:
+        before: Runs before the step; they remain unchanged.
+        requests: (A, sensors, N), the alternatives.
+        noise: Standard normals (channels, N) of the step.
+        taken: Outcome of the step with the actual requests.
+        observation: Observations (N, entries) after that step.
+        beliefs: Beliefs after that step.
     """
     many, sensors, runs = requests.shape
-    values = np.tile(np.arange(runs), many)  # where each one's results are; first the taken ones
+    values = np.tile(np.arange(runs), many)  # columns of results, the taken step first
     granted = before.answer(requests.transpose(1, 0, 2).reshape(sensors, -1), values).granted
     other = np.flatnonzero((granted != np.tile(taken.granted, many)).any(0))
     error, communication = taken.error, taken.reward_communication

@@ -1,4 +1,4 @@
-"""The batched core: N episodes of one task side by side, with their noise, tokens and rewards."""
+"""The batched core: N episodes of one task with their noise, tokens and rewards."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from fusion_gym.core.runs import Outcome, Runs
 from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 
-# Normals that are drawn and kept at a time, at least one step's: of a run, and of all (64 MB).
+# Normals in a block, of one run and of all runs (64 MB); a block has at least one step.
 _BLOCK_OF_RUN, _BLOCK = 2**11, 2**23
-_TOGETHER = 256  # runs whose normals are transposed at a time and so stay in the cache
+_TOGETHER = 256  # runs per transposition, which then stays in the cache
 
 
 class EpisodeBatch(Runs):
     """N runs of a :class:`~fusion_gym.core.task.Task`, advanced together.
 
-    All noise is a function of a run's seed, the episode's number and the step, whatever the
-    actions: a seed fixes an episode's noise (common random numbers), and a run does not depend
-    on what stands beside it (batch invariance). ``noise`` is its source, by default
-    :class:`~fusion_gym.core.noise.PhiloxNoise`.
+    The noise is a function of a run's seed, the episode's number and the step, and independent of
+    actions (common random numbers) and of other runs (batch invariance).
 
-    ``remember`` says whose memory is kept, the scheduler's or every sensor's own; ``None`` is
-    the scheduler's in a task with memory, and nothing in one without.
-
-    ``reference`` is a system on the same noise whose filter takes in every measurement beside the
-    run, whoever decides: after each step ``reference_error`` (n, N) is the truth minus its fused
-    estimate x*. It is for rewards in training, and no policy sees it.
+    Args:
+        task: The task.
+        num_envs: Number N of runs.
+        remember: Owner of the memory: ``"scheduler"``, or ``"own"`` for every local sensor;
+            ``None`` is the scheduler.
+        reference: System on the same noise whose filter processes every measurement, for rewards in
+            training. After each step ``reference_error`` (n, N) is the truth minus its estimate x*.
+        noise: Source of the noise, by default :class:`~fusion_gym.core.noise.PhiloxNoise`.
     """
 
     reference_error: Array
@@ -60,7 +60,7 @@ class EpisodeBatch(Runs):
         self.episodes = np.full(num_envs, -1)
         self.state = None
         self.reference = reference
-        # Where the scheduler's own memory is that of the reference, it is not kept twice.
+        # The scheduler's memory replaces an identical reference.
         self._shared = (
             reference is not None and memory.keeps_every and reference is task.memory_system
         )
@@ -73,24 +73,20 @@ class EpisodeBatch(Runs):
         self._limit = np.full(num_envs, task.horizon, dtype=np.int64)
         most = min(_BLOCK_OF_RUN, _BLOCK // num_envs) // max(1, self.channels)
         self._block = np.zeros((min(task.horizon + 1, max(1, most)), self.channels, num_envs))
-        self._row = 0  # of the block: the noise of the last sensing
+        self._row = 0  # row of the block with the last sensing's noise
 
     @classmethod
     def seeded(
         cls, task: Task, episodes: int, seed: int, remember: Owner | None = None
     ) -> EpisodeBatch:
-        """Episodes side by side, sensed once, with the seeds ``seed``, ``seed + 1``, …"""
+        """Return a batch after its first sensing, with the seeds ``seed``, ``seed + 1``, …"""
         batch = cls(task, episodes, remember)
         batch.seed(np.arange(episodes), [seed + i for i in range(episodes)])
         batch.reset()
         return batch
 
     def seed(self, runs: NDArray[np.int64], seeds: Sequence[int | None]) -> None:
-        """Set the seeds of these runs' next episodes; ``None`` keeps a run's (at first random).
-
-        Raises:
-            ConfigurationError: a seed that is not a whole number >= 0.
-        """
+        """Set the seeds of these runs' next episodes; ``None`` leaves a run's seed unchanged."""
         for run, seed in zip(runs.tolist(), seeds, strict=True):
             if seed is not None:
                 self.seeds[run] = validation.integer("seed", seed, at_least=0)
@@ -103,11 +99,13 @@ class EpisodeBatch(Runs):
         stagger: bool = False,
         groups: int | None = None,
     ) -> None:
-        """Begin new episodes in the given runs (all by default) and sense for the first time.
+        """Begin new episodes and sense for the first time.
 
-        ``stagger`` spreads the lengths of these first episodes evenly up to the horizon, so that
-        later ones do not all end in the same step: each run has its own, or each of ``groups``, for
-        a step in which some episode begins costs almost as much as if all did.
+        Args:
+            runs: Numbers of the runs; by default all.
+            stagger: Whether the lengths of these episodes spread evenly up to the horizon.
+            groups: Number of different lengths with ``stagger``; by default one per run. Few groups
+                are faster, because a step with one reset costs almost as much as a step with many.
         """
         runs = np.arange(self.num_envs) if runs is None else runs
         everyone = np.array_equal(runs, np.arange(self.num_envs))
@@ -143,13 +141,16 @@ class EpisodeBatch(Runs):
         self.queue = merge_runs(self.queue, self.task.bucket.start_queue(len(runs)), runs)
 
     def step(self, requests: NDArray[np.bool_]) -> Outcome:
-        """Answer the requests (sensors, N), update, fuse, reward; then move and sense.
+        """Grant requests, update, fuse and reward; then move the plant and sense.
 
-        Runs that are ``finished`` are carried along without meaning until they are reset.
+        Finished runs continue without meaning until they are reset.
+
+        Args:
+            requests: (sensors, N) bool.
 
         Raises:
-            ResetNeeded: before the first reset.
-            DivergenceError: an error that is not finite, of a run that goes on.
+            ResetNeeded: The batch was never reset.
+            DivergenceError: The error of an unfinished run is not finite.
         """
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
@@ -171,40 +172,36 @@ class EpisodeBatch(Runs):
         return outcome
 
     def observe(self) -> NDArray[np.float32]:
-        """Observations (N, entries) of all runs, a fresh array.
-
-        Raises:
-            DivergenceError: an entry that is not a number, of a run that goes on.
-        """
+        """Return observations (N, entries); NaN in an unfinished run is a ``DivergenceError``."""
         observation = super().observe()
         if not math.isfinite(np.vdot(observation, observation)):
-            entry = np.isnan(observation).argmax(1)  # the first one of each run
+            entry = np.isnan(observation).argmax(1)  # first NaN of each run
             values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}
             require_finite(values, self.finished, self.steps)
         return observation
 
     def normals(self) -> Array:
-        """The normals (channels, N) of the last sensing, a view that later steps overwrite."""
+        """Return a view of the last sensing's normals (channels, N)."""
         return self._block[self._row]
 
     def noise(self) -> Array:
-        """Those of them that the system takes."""
+        """Return the part (noise_channels, N) of :meth:`normals` that the system takes."""
         return self.normals()[: self.task.system.noise_channels]
 
     def snapshot(self) -> dict[str, Any]:
-        """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
+        """Return the state of all runs for :meth:`restore`, valid until the next step."""
         fixed = ("task", "layout", "memory", "reference", "source")
         moving = {key: value for key, value in vars(self).items() if key not in fixed}
         return moving | {"memory_states": self.memory.states}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Put the runs where they were at a :meth:`snapshot` of a batch like this one."""
+        """Set all runs to a :meth:`snapshot` of a batch of the same task."""
         moving = dict(snapshot)
         self.memory = self.memory.with_states(moving.pop("memory_states"))
         vars(self).update(moving)
 
     def _refer(self, system: System[Any]) -> None:
-        """Let the reference take in every measurement of this step."""
+        """Update the reference with every measurement of this step."""
         if self._shared:
             assert self.memory.states is not None
             beside = self.memory.states.every
@@ -217,12 +214,12 @@ class EpisodeBatch(Runs):
         return self.normals()[-1] if self.task.access == "random" else None
 
     def _keys(self, runs: NDArray[np.int64]) -> list[tuple[int, int]]:
-        """Seed and number of the episodes of these runs."""
+        """Return seed and episode number of these runs."""
         seeds = [self.seeds[run] for run in runs.tolist()]
         return list(zip(seeds, self.episodes[runs].tolist(), strict=True))
 
     def _draw(self, runs: NDArray[np.int64]) -> None:
-        """Draw the noise of these runs from this row to the block's end, or the episode's."""
+        """Draw the noise of these runs from this row to the end of the block or episode."""
         rows, channels = len(self._block) - self._row, self.channels
         lanes = self._block[self._row :].reshape(-1, self.num_envs)
         counts = np.clip(self._limit[runs] + 1 - self.steps[runs], 0, rows)

@@ -1,9 +1,10 @@
-"""What could be known, what the centre knows, and what every transmission would be worth.
+"""The estimates with and without a transmission, and the value of each transmission.
 
-x* is the best estimate of whoever looks, x̂ the centre's if nobody transmits, x̂(s) if s alone does.
-Value of a transmission: v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖², the expectation over arrival; it can be
-negative. With memory x* holds everything that its owner measured and heard
-(:mod:`fusion_gym.core.memory`), without it what the centre knows and this step's measurements.
+x* is the best estimate of the memory's owner, x̂ the centre's estimate without a transmission, and
+x̂(s) with a transmission of sensor s only. The value of a transmission is
+v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖², with the expectation over the arrival; it can be negative. With
+memory x* uses all measurements and received packets of its owner (:mod:`fusion_gym.core.memory`),
+without memory the centre's knowledge and the new measurements.
 
 Sources: Y. Xu and J. P. Hespanha, "Optimal communication logics in networked control systems",
 IEEE CDC 2004, and G. M. Lipsa and N. C. Martins, "Remote state estimation with communication costs
@@ -36,11 +37,13 @@ Packets = NDArray[np.bool_]
 
 @dataclass(slots=True)
 class MemoryStates:
-    """What is kept of N runs, states after sensing; ``None`` where it is not needed.
+    """The memory states of N runs after sensing, ``None`` where none is needed.
 
-    ``every`` (N runs) has taken in all measurements · ``own`` (sensors · N runs, those of a sensor
-    together) one sensor's, and what it heard · ``single`` (the same) is the centre to which that
-    sensor alone has sent.
+    Attributes:
+        every: State (N runs) of a filter with all measurements.
+        own: States (sensors · N runs, a sensor's runs adjacent) of a filter with one sensor's
+            measurements and received packets.
+        single: States, in the order of ``own``, of a centre with deliveries from that sensor only.
     """
 
     every: Any = None
@@ -50,9 +53,11 @@ class MemoryStates:
 
 @dataclass(frozen=True)
 class Estimate:
-    """``mean`` (k, n, N) and ``covariance`` (k, n, n, N): k = 1 for all, or one a sensor.
+    """A mean (k, n, N) and a covariance (k, n, n, N), with k = 1 or one estimate per sensor.
 
-    Covariances may be ``source`` as a function, for they are large where there are many states.
+    Args:
+        mean: (k, n, N).
+        source: The covariance (k, n, n, N), or a function that computes it on first access.
     """
 
     mean: Array
@@ -60,21 +65,28 @@ class Estimate:
 
     @cached_property
     def covariance(self) -> Array:
-        """The covariance, computed when first looked at."""
+        """Covariance, computed on first access."""
         return self.source() if callable(self.source) else self.source
 
     def __iter__(self) -> Iterator[Array]:
         return iter((self.mean, self.covariance))
 
     def __reduce__(self) -> tuple[type[Estimate], tuple[Array, Array]]:
-        """Pickled with the covariance, for a function cannot be."""
+        """Pickle the computed covariance, because its function may not be picklable."""
         return Estimate, (self.mean, self.covariance)
 
 
 class Beliefs(ABC):
-    """The estimates before anything is sent, of N runs, each computed when first looked at.
+    """The estimates of N runs before any transmission, each computed on first access.
 
-    ``arrival`` (sensors, N) is the probability that a packet sent now arrives; None: surely.
+    Args:
+        task: The task.
+        state: The system's state after sensing.
+        memory_states: The memory states.
+        best: x*, if it is known.
+
+    Attributes:
+        arrival: Probability (sensors, N) that a packet arrives if it is sent now; ``None`` is 1.
     """
 
     def __init__(
@@ -92,22 +104,22 @@ class Beliefs(ABC):
     @property
     @abstractmethod
     def silent(self) -> Estimate:
-        """x̂, the centre's estimate if nobody transmits, as far as its owner knows it."""
+        """x̂, the centre's estimate without a transmission, as the owner knows it."""
 
     @property
     @abstractmethod
     def sent(self) -> Estimate:
-        """x̂(s), k = sensors, the centre's estimate if the packet of s alone arrives."""
+        """x̂(s), k = sensors, the centre's estimate if only the packet of s arrives."""
 
     @property
     @abstractmethod
     def best(self) -> Estimate:
-        """x*, with all that its owner knows."""
+        """x*, the estimate with all knowledge of the owner."""
 
     @property
     @abstractmethod
     def memory_posterior(self) -> Any:
-        """The shadow with its owner's new measurements."""
+        """Memory state after the update with the owner's new measurements."""
 
     @cached_property
     def difference(self) -> Array:
@@ -115,19 +127,25 @@ class Beliefs(ABC):
         return self.best.mean - self.silent.mean
 
     def loss(self, steps: int = 1) -> Array:
-        """‖x* - x̂‖² (k, N), weighted by ``task.relative_weights``.
+        """Return ‖x* - x̂‖² (k, N), weighted by ``task.relative_weights``.
+
+        Args:
+            steps: 1, or for the scheduler the number of steps over which the loss is summed.
 
         Raises:
-            ValueError: more steps than one, where its owner has no model of the centre.
+            ValueError: ``steps`` exceeds 1 for an owner without a model of the centre.
         """
         _one(steps)
         return self._weighted(self.difference)
 
     def value(self, steps: int = 1) -> Array:
-        """v(s) (sensors, N), weighted by ``task.relative_weights``.
+        """Return v(s) (sensors, N), weighted by ``task.relative_weights``.
+
+        Args:
+            steps: 1, or for the scheduler the number of steps over which the value is summed.
 
         Raises:
-            ValueError: as :meth:`loss`.
+            ValueError: ``steps`` exceeds 1 for an owner without a model of the centre.
         """
         _one(steps)
         return self._expected(self.loss(), self._weighted(self.best.mean - self.sent.mean))
@@ -144,16 +162,16 @@ class Beliefs(ABC):
 
 
 class SchedulerBeliefs(Beliefs):
-    """Of whoever sees all sensors' new measurements and knows all that the centre knows."""
+    """The beliefs of the scheduler, from all new measurements and the centre's knowledge."""
 
     @cached_property
     def silent(self) -> Estimate:
-        """See :class:`Beliefs`."""
+        """x̂, the centre's estimate without a transmission."""
         return _of(self.task.system, self._silent)
 
     @cached_property
     def sent(self) -> Estimate:
-        """See :class:`Beliefs`; with ``packet="estimate"`` every packet carries x*."""
+        """x̂(s); with ``packet="estimate"`` it is x* for every s."""
         if self.task.packet == "estimate":
             return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
         if self.task.system.offers("fused_alone"):
@@ -166,12 +184,12 @@ class SchedulerBeliefs(Beliefs):
 
     @cached_property
     def best(self) -> Estimate:
-        """See :class:`Beliefs`."""
+        """x*, the estimate with all knowledge of the scheduler."""
         return _of(self.task.memory_system or self.task.system, self.memory_posterior)
 
     @cached_property
     def memory_posterior(self) -> Any:
-        """See :class:`Beliefs`; without memory the centre's, had all packets arrived."""
+        """Memory state after the update; without memory the centre's state after all packets."""
         everyone = ~self._nobody(self._runs)
         if self.memory_states.every is None:
             return arrived(self.task.system, self._state, everyone)
@@ -179,13 +197,13 @@ class SchedulerBeliefs(Beliefs):
         return arrived(self.task.memory_system, self.memory_states.every, everyone)
 
     def loss(self, steps: int = 1) -> Array:
-        """See :class:`Beliefs`; summed over ``steps`` times without noise and transmissions."""
+        """Return ‖x* - x̂‖² (1, N), summed over ``steps`` steps without noise and transmissions."""
         if steps == 1:
             return super().loss()
         return self._weighted(self._path(self._silent, steps) - self._best_path(steps)).sum(0)[None]
 
     def value(self, steps: int = 1) -> Array:
-        """See :class:`Beliefs`; summed over ``steps`` times without noise and transmissions."""
+        """Return v(s) (sensors, N), summed over ``steps`` steps without noise and transmissions."""
         if steps == 1:
             return super().value()
         best = self._best_path(steps)
@@ -203,7 +221,7 @@ class SchedulerBeliefs(Beliefs):
 
     @cached_property
     def _sent(self) -> list[Any]:
-        """The centre's states after each sensor's packet alone."""
+        """The centre's states after each sensor's packet only."""
         result = []
         for sensor in range(self.task.sensors):
             single = self._nobody(self._runs)
@@ -221,11 +239,11 @@ class SchedulerBeliefs(Beliefs):
 
 
 class OwnBeliefs(Beliefs):
-    """The beliefs of local sensors (k = sensors), by their measurements and what they receive."""
+    """The beliefs of local sensors (k = sensors), from their measurements and received packets."""
 
     @cached_property
     def silent(self) -> Estimate:
-        """See :class:`Beliefs`."""
+        """x̂, the centre's estimate without a transmission, as each sensor knows it."""
         system, sensors = self.task.system, self.task.sensors
         if self.task.broadcast == "none":
             nobody = self._nobody(sensors * self._runs)
@@ -238,7 +256,7 @@ class OwnBeliefs(Beliefs):
 
     @cached_property
     def sent(self) -> Estimate:
-        """See :class:`Beliefs`."""
+        """x̂(s), the centre's estimate if only the packet of s arrives, as sensor s knows it."""
         system, itself = self.task.system, self._itself
         if self.memory_states.single is None:
             if system.offers("fused_alone"):
@@ -250,7 +268,7 @@ class OwnBeliefs(Beliefs):
 
     @cached_property
     def best(self) -> Estimate:
-        """See :class:`Beliefs`."""
+        """x*, the estimate with all knowledge of each sensor."""
         if self.task.memory_system is None:
             return self.sent
         own = self._each(self.task.memory_system, self.memory_posterior)
@@ -260,7 +278,7 @@ class OwnBeliefs(Beliefs):
 
     @cached_property
     def memory_posterior(self) -> Any:
-        """See :class:`Beliefs`."""
+        """Memory states after the update with each sensor's own measurement."""
         assert self.task.memory_system is not None
         return arrived(self.task.memory_system, self.memory_states.own, self._itself)
 
@@ -270,7 +288,7 @@ class OwnBeliefs(Beliefs):
         return np.repeat(np.eye(self.task.sensors, dtype=np.bool_), self._runs, axis=-1)
 
     def _each(self, system: System[Any], delivered: Any) -> Estimate:
-        """From sensors · N runs to an estimate a sensor."""
+        """Return one estimate per sensor from sensors · N runs."""
         shape, whole = (self.task.sensors, self._runs), _of(system, delivered)
 
         def apart(values: Array) -> Array:
@@ -288,15 +306,12 @@ def _one(steps: int) -> None:
 
 
 def arriving(system: System[Any], state: Any, packets: Packets) -> Any:
-    """The state of a system in which these packets (sensors, N), if they are sent, arrive."""
+    """Return the state in which the channel does not lose these packets (sensors, N)."""
     return system.arriving(state, packets) if system.offers("arriving") else state
 
 
 def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
-    """Fused means (steps, n, N) from a delivered state on, without noise and transmissions.
-
-    The expectation of a linear system.
-    """
+    """Return fused means (steps, n, N) without noise and transmissions."""
     runs = system.truth(delivered).shape[-1]
     still = np.zeros((system.noise_channels, runs))
     silence = np.zeros((system.sensor_count, runs), dtype=np.bool_)
@@ -308,7 +323,7 @@ def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
 
 
 def arrived(system: System[Any], state: Any, packets: Packets) -> Any:
-    """The state after the arrival of these packets and no others."""
+    """Return the state after the arrival of these packets and no others."""
     return system.deliver(arriving(system, state, packets), packets)
 
 
@@ -317,7 +332,7 @@ def _of(system: System[Any], delivered: Any) -> Estimate:
 
 
 def _joined(first: Estimate, second: Estimate) -> Estimate:
-    """Covariance intersection of two estimates, each sensor's by itself."""
+    """Return the covariance intersection of two estimates of each sensor."""
     sensors, states, runs = first.mean.shape
 
     def flat(array: Array) -> Array:

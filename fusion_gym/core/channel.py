@@ -1,4 +1,4 @@
-"""Channels that lose what was granted: perfect, independent losses, Gilbert-Elliott."""
+"""Lossy channels: perfect, independent losses, Gilbert-Elliott."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ class Channel:
     """Each sensor's own channel: a Markov chain whose state sets the probability of a loss.
 
     The state moves from S(t-1) to S(t) at every step, used or not, and a packet sent at time t is
-    lost with the probability that belongs to S(t). With one state, losses are independent.
+    lost with the probability of S(t). With one state, losses are independent.
 
-    Shapes: ``transition`` (states, states), rows sum to 1; ``drop`` (states, sensors);
-    ``initial`` (states,), the distribution of S(0).
+    Args:
+        transition: (states, states), rows sum to 1.
+        drop: Loss probabilities (states, sensors).
+        initial: Distribution (states,) of S(0).
 
     Source: Chakravorty and Mahajan, "Remote estimation over a packet-drop channel with Markovian
     state", IEEE Trans. Automatic Control 65, 2020, Section II.
@@ -37,16 +39,12 @@ class Channel:
 
     @classmethod
     def perfect(cls, sensors: int) -> Channel:
-        """Nothing is ever lost."""
+        """Return a channel without losses."""
         return cls(np.ones((1, 1)), np.zeros((1, sensors)), np.ones(1))
 
     @classmethod
     def independent(cls, drop_probability: ArrayLike, sensors: int) -> Channel:
-        """Every packet is lost with a probability: one number, or one for each sensor.
-
-        Raises:
-            ConfigurationError: not a probability, or another shape.
-        """
+        """Return a channel with independent losses, one probability or one per sensor."""
         drop = _probabilities("drop_probability", drop_probability, (1, sensors))
         return cls(np.ones((1, 1)), drop, np.ones(1))
 
@@ -58,14 +56,17 @@ class Channel:
         sensors: int,
         initial: str = "stationary",
     ) -> Channel:
-        """Two states, bad and good, of the same chain for every sensor's own channel.
+        """Return independent channels with the states bad and good, one channel per sensor.
 
-        ``transition`` is the (2, 2) matrix from the last state (row) to the next, ``drop`` the
-        pair of loss probabilities (bad, good); ``initial`` is the state at time 0.
+        Args:
+            transition: (2, 2), from the last state (row) to the next.
+            drop_probability: Loss probabilities (bad, good).
+            sensors: Number of sensors.
+            initial: State at time 0: ``"stationary"``, ``"bad"`` or ``"good"``.
 
         Raises:
-            ConfigurationError: not probabilities, rows that do not sum to 1, an unknown initial
-                state, or a stationary start where the chain has no unique stationary law.
+            ConfigurationError: A probability is outside [0, 1], a row does not sum to 1, or the
+                chain has no unique stationary law.
         """
         matrix = validation.array("channel_transition", transition, (2, 2))
         if np.any(matrix < 0.0) or not np.allclose(matrix.sum(1), 1.0, rtol=0.0, atol=1e-9):
@@ -93,21 +94,23 @@ class Channel:
 
     @property
     def loses(self) -> bool:
-        """Whether anything can be lost."""
+        """Whether a loss probability is positive."""
         return bool(np.any(self.drop > 0.0))
 
     def start(self, noise: Array) -> NDArray[np.int64]:
-        """S(0), shape (sensors, N), from standard normals (sensors, N)."""
+        """Return S(0), shape (sensors, N), from standard normals (sensors, N)."""
         return _choose(self.initial[:, None, None], noise)
 
     def advance(self, state: NDArray[np.int64], noise: Array) -> NDArray[np.int64]:
-        """S(t), shape (sensors, N), from S(t-1) and standard normals (sensors, N)."""
+        """Return S(t), shape (sensors, N), from S(t-1) and standard normals (sensors, N)."""
         return _choose(self.transition.T[:, state], noise)
 
     def lost(self, state: NDArray[np.int64], noise: Array) -> NDArray[np.bool_]:
-        """Whether a packet sent in this state (sensors, N) is lost; standard normals (sensors, N).
+        """Return whether a packet sent in this state is lost, drawn for every sensor and step.
 
-        It is decided whether or not one is sent, so that a seed fixes it whatever the actions.
+        Args:
+            state: S(t), shape (sensors, N).
+            noise: Standard normals (sensors, N), used whether or not a packet is sent.
         """
         sensor = np.arange(len(state))[:, None]
         return ndtr(noise) < self.drop[state, sensor]

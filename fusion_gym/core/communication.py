@@ -1,4 +1,4 @@
-"""The communication model: what a packet holds, what a node receives, whether it has memory."""
+"""The communication model: content of packets, broadcasts, memory."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
@@ -12,9 +12,13 @@ FEATURES: tuple[str, ...] = get_args(Feature)
 
 
 class Communication(NamedTuple):
-    """A scenario's model beside its options: ``broadcast``, never ``None``; ``memory_system``, the
-    system that remembers beside the run, ``None`` where it is not needed; the memory's ``features``
-    in the observation."""
+    """The checked communication model of a scenario.
+
+    Attributes:
+        broadcast: ``"none"``, ``"estimate"`` or ``"packets"``.
+        memory_system: System whose filter is the memory, or ``None`` without memory.
+        features: Observation entries of the memory, ``"difference"`` and ``"value"``.
+    """
 
     broadcast: str
     memory_system: System[Any] | None
@@ -22,11 +26,7 @@ class Communication(NamedTuple):
 
 
 def communication(scenario: Scenario) -> Communication:
-    """The model of a scenario's options, checked.
-
-    Raises:
-        ConfigurationError: a value that is not allowed, alone or with the others.
-    """
+    """Return the checked communication model of a scenario."""
     options = scenario.options
     remembers, memory_system = options.memory, scenario.memory_system
     if memory_system is None and not scenario.nodes_remember:
@@ -75,7 +75,7 @@ def _broadcast(scenario: Scenario) -> str:
 
 
 def _features(value: Any, remembers: bool) -> tuple[str, ...]:
-    """What the observation shows of what is believed: with memory all of it by default."""
+    """Return the observation entries of the memory, by default all with memory."""
     if value is None:
         return FEATURES if remembers else ()
     if value is True:

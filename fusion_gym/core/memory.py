@@ -1,16 +1,15 @@
-"""What was measured and not sent: the memory of the owner of N runs, and what it believes.
+"""The memory of N runs: measurements that were taken and not sent, and the beliefs they imply.
 
-A memory state is the same plant on the same noise, tokens and past channel, with a filter that has
-taken in every measurement that its owner has. The scheduler sees all sensors. A local sensor has
-its own measurements and what it receives, by the option ``broadcast``:
+A memory state belongs to the same plant, noise, tokens and past channel, with a filter that has
+processed every measurement of its owner. The scheduler has all measurements. A local sensor has its
+own measurements and the broadcasts:
 
-- ``"none"``: nothing. It knows which of its packets arrived, and takes for the centre's estimate
-  what that would be if nobody else ever sent.
-- ``"estimate"``: the centre's prediction with its covariance. It joins its own estimate with that
-  by covariance intersection, for it does not know what the two have in common.
-- ``"packets"``: every packet that arrived, so it knows all that the centre knows.
+- ``"none"``: It knows which of its packets arrived, and models a centre with its packets only.
+- ``"estimate"``: It receives the centre's prediction with its covariance, and joins it with its own
+  estimate by covariance intersection, because their cross-correlation is unknown.
+- ``"packets"``: It receives every packet that arrived and knows everything that the centre knows.
 
-What follows from the memory is in :mod:`fusion_gym.core.beliefs`.
+:mod:`fusion_gym.core.beliefs` has the beliefs.
 """
 
 import copy
@@ -37,13 +36,17 @@ from fusion_gym.errors import refusal
 
 
 class Memory:
-    """What the owner of a task's runs remembers, moved along with them, and what it believes.
+    """The memory of a task's runs, which moves with them.
 
-    ``owner`` is the scheduler, or every sensor by itself. ``states`` are the memory states after
-    sensing, ``None`` where nothing is remembered from step to step.
+    Args:
+        task: The task.
+        owner: ``"scheduler"``, or ``"own"`` for every local sensor.
+
+    Attributes:
+        states: Memory states after sensing, ``None`` without any.
 
     Raises:
-        ConfigurationError: sensors by themselves, where packets hold the scheduler's estimate.
+        ConfigurationError: The owner is local and packets hold the scheduler's estimate.
     """
 
     def __init__(self, task: Task, owner: Owner) -> None:
@@ -68,10 +71,14 @@ class Memory:
     def begin(
         self, noise: Array, fresh: Any, row: Array, runs: NDArray[np.int64], num_envs: int
     ) -> None:
-        """Start and sense in the given ones of ``num_envs`` runs.
+        """Start and sense in the R runs ``runs``.
 
-        ``noise`` (start_channels, R) and ``fresh`` are the start's normals and states, ``row``
-        (noise_channels, R) the normals of the first sensing.
+        Args:
+            noise: Normals (start_channels, R) of the start.
+            fresh: The system's states of the start.
+            row: Normals (noise_channels, R) of the first sensing.
+            runs: Numbers of the runs (R,).
+            num_envs: Number of all runs.
         """
         self._beliefs = None
         if self.states is None:
@@ -98,17 +105,20 @@ class Memory:
         self.states = new
 
     def beliefs(self, state: Any) -> Beliefs:
-        """Return what the owner believes before anything is sent, of the runs' sensed state."""
+        """Return the owner's beliefs before any transmission in the runs' sensed state."""
         if self._beliefs is None:
             self._beliefs = self._make_beliefs(state)
         return self._beliefs
 
     def deliver(self, state: Any, delivered: Any, granted: NDArray[np.bool_]) -> Any:
-        """Take in the network's answer (sensors, N) to the runs' sensed state.
+        """Update the memory after grants (sensors, N) in the runs' sensed state.
 
-        The owner remembers its own measurements and receives others' packets. Returns the
-        delivered state; with ``packet="estimate"`` its centre goes on from x* where a packet
-        arrived.
+        With ``packet="estimate"`` the centre of the returned state has x* where a packet arrived.
+
+        Args:
+            state: The runs' sensed state.
+            delivered: The system's state after its delivery.
+            granted: (sensors, N) bool.
         """
         if self.task.packet == "estimate":
             mean, covariance = self.beliefs(state).best
@@ -125,7 +135,7 @@ class Memory:
         self._beliefs = None
 
     def branch(self, runs: NDArray[np.int64] | None, num_envs: int) -> Self:
-        """Return the memory of the given ones of ``num_envs`` runs, or of all, to move apart."""
+        """Return an independent memory of ``runs`` of the ``num_envs`` runs, by default of all."""
         result = copy.copy(self)
         if runs is not None:
             result._beliefs = None
@@ -139,24 +149,24 @@ class Memory:
         return result
 
     def with_states(self, states: MemoryStates | None) -> Self:
-        """Return the memory of other runs, in these states."""
+        """Return a memory of other runs with these states."""
         result = copy.copy(self)
         result.states, result._beliefs = states, None
         return result
 
     def with_best(self, state: Any, best: Estimate) -> Self:
-        """Return the memory of runs in a sensed state whose x* is known and not computed."""
+        """Return a memory of runs in a sensed state with known x*."""
         result = self.with_states(None)
         result._beliefs = result._make_beliefs(state, best)
         return result
 
     def signals(self, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
-        """Return the signals of what is believed, by name."""
+        """Return the signals of the beliefs by name."""
         return memory_signals(self.owner, beliefs)
 
     @property
     def missing_signals(self) -> Mapping[str, str]:
-        """The signals of what others believe, and why they are not there."""
+        """Names of the signals of another owner's beliefs, and the reasons for their absence."""
         return missing_signals(self.owner)
 
     def _make_beliefs(self, state: Any, best: Estimate | None = None) -> Beliefs:
@@ -197,5 +207,5 @@ class Memory:
         return result
 
     def _places(self, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:
-        """Where the runs (R,) of every sensor stand, (sensors · R,)."""
+        """Return the positions (sensors · R,) of the runs (R,) of every sensor."""
         return (np.arange(self.task.sensors)[:, None] * num_envs + runs).ravel()

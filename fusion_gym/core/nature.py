@@ -1,4 +1,4 @@
-"""How the truth departs from the model that filters and policies assume."""
+"""The departure of the truth from the model that filters and policies assume."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, refusal
 
-# The rows of a departure, by the options that they come from, with what an environment must have.
+# Option of each row of a departure, and the reason why an environment may refuse it.
 DEPARTURES = {
     "true_process_noise": "the plant has no process noise",
     "true_measurement_noise": "the sensors measure without noise",
@@ -21,20 +21,23 @@ DEPARTURES = {
     "true_transition": "the plant stays where noise and input put it",
 }
 _SHIFT = "true_threshold_shift"
-_MODEL = (1.0, 1.0, 0.0, 1.0)  # no departure at all
+_MODEL = (1.0, 1.0, 0.0, 1.0)  # no departure
 _FACTORS = (1e-3, 1e3)
 _LARGEST_GROWTH = 1e24  # of the plant's second moment over an episode
 
 
 @dataclass(frozen=True)
 class Nature:
-    """By how much the truth departs from the model that filters and policies assume.
+    """The range of the departure of the truth from the model that filters and policies assume.
 
-    A departure (4, N) is what N runs have of it: the factors on the deviations of process and of
-    measurement noise, what is added to the limits of the sensors, and the factor c of the motion,
-    which takes the plant from x to x + c (f(x) - x) where the model says f(x). ``None`` stands for
-    none. Each episode draws its own between ``low`` and ``high`` (4,), factors evenly in the
-    logarithm, the shift evenly; where both are equal nothing is drawn.
+    A departure (4, N) has the factors of the standard deviations of process and measurement noise,
+    the shift of the sensors' limits, and the factor c of the motion from x to x + c (f(x) - x);
+    ``None`` is no departure. Each episode draws between ``low`` and ``high``, factors uniformly in
+    the logarithm, the shift uniformly.
+
+    Args:
+        low: Lower ends (4,).
+        high: Upper ends (4,); equal ends need no draw.
     """
 
     low: tuple[float, ...] = _MODEL
@@ -42,11 +45,15 @@ class Nature:
 
     @classmethod
     def create(cls, selection: object, absent: Collection[str] = ()) -> Nature:
-        """Of the options; ``absent`` are those of them that can change nothing here.
+        """Return the departure that the options declare.
+
+        Args:
+            selection: Object with the options of ``DEPARTURES``.
+            absent: Options without an effect in this environment.
 
         Raises:
-            ConfigurationError: neither a number nor a pair (low, high) that rises, a factor outside
-                0.001 to 1000, or an option that can change nothing and is asked to.
+            ConfigurationError: An option is neither a number nor a rising pair (low, high), a
+                factor is outside 0.001 to 1000, or an absent option departs from the model.
         """
         pairs = [_span(name, getattr(selection, name)) for name in DEPARTURES]
         nature = cls(*(tuple(ends) for ends in zip(*pairs, strict=True)))
@@ -60,17 +67,17 @@ class Nature:
 
     @property
     def departing(self) -> tuple[str, ...]:
-        """The options in which the truth is not the model."""
+        """Names of the options that depart from the model."""
         ends = zip(DEPARTURES, self.low, self.high, _MODEL, strict=True)
         return tuple(name for name, low, high, model in ends if not low == high == model)
 
     @property
     def channels(self) -> int:
-        """Standard normals at the end of a start's: one for each option that is drawn."""
+        """Number of standard normals at the end of a start: one per option with a range."""
         return sum(low < high for low, high in zip(self.low, self.high, strict=True))
 
     def begin(self, noise: Array) -> tuple[Array, Array | None]:
-        """A start's own normals, and the departure (4, N) that the :attr:`channels` last draw."""
+        """Return the system's normals, and the departure (4, N) from the last :attr:`channels`."""
         if not self.departing:
             return noise, None
         own, last = np.split(noise, (len(noise) - self.channels,))
@@ -86,11 +93,7 @@ class Nature:
         return own, departure
 
     def check_growth(self, radius: Callable[[float], float], horizon: int) -> None:
-        """Whether the plant stays within bounds, of a spectral radius that follows from c.
-
-        Raises:
-            ConfigurationError: it does not.
-        """
+        """Raise an error if the true plant with spectral radius ``radius(c)`` grows too much."""
         ends = {self.low[-1], self.high[-1]} - {_MODEL[-1]}
         largest = max((radius(end) for end in ends), default=0.0)
         if 2.0 * horizon * np.log10(max(largest, 1.0)) > np.log10(_LARGEST_GROWTH):
@@ -101,11 +104,7 @@ class Nature:
             )
 
     def refuse(self, where: str, why: str = "that holds where the truth is as assumed") -> None:
-        """Refuse any departure.
-
-        Raises:
-            ConfigurationError: the truth departs from the model; says where and why it must not.
-        """
+        """Raise an error if the truth departs from the model, with place and reason."""
         for name in self.departing:
             raise ConfigurationError(
                 f"{name} = {self._given(name)} is not allowed {where}: it must be "
@@ -122,7 +121,7 @@ AS_ASSUMED = Nature()
 
 
 def _span(name: str, value: Any) -> tuple[float, float]:
-    """Both ends of what an option draws from, equal for a number."""
+    """Return both ends of an option's range, equal for a number."""
     low, high = validation.spread(name, value, (2,)).tolist()
     least, most = (-np.inf, np.inf) if name == _SHIFT else _FACTORS
     if not (least <= low and high <= most and (np.ndim(value) == 0 or low < high)):
@@ -132,17 +131,17 @@ def _span(name: str, value: Any) -> tuple[float, float]:
 
 
 def true_noise(departure: Array | None, process: Array, measurement: Array) -> tuple[Array, Array]:
-    """Noises (…, N) of process and measurement as they really are, of those of the model."""
+    """Return the true noises (…, N) of process and measurement from the model's noises."""
     if departure is None:
         return process, measurement
     return departure[0] * process, departure[1] * measurement
 
 
 def true_motion(departure: Array | None, state: Array, moved: Array) -> Array:
-    """Where x (n, N) really goes, x + c (f(x) - x), where the model has it ``moved`` to f(x)."""
+    """Return the true next state x + c (f(x) - x) from x (n, N) and ``moved`` = f(x)."""
     return moved if departure is None else moved + (departure[3] - 1.0) * (moved - state)
 
 
 def true_limits(departure: Array | None, limit: Array) -> Array:
-    """The limits (…, 1) of the model's sensors as they really are, (…, N)."""
+    """Return the true limits (…, N) of the sensors from the model's limits (…, 1)."""
     return limit if departure is None else limit + departure[2]

@@ -1,4 +1,4 @@
-"""Noise of episodes, a function of the seed, the episode's number and the step."""
+"""The noise of episodes as a function of seed, episode number and step."""
 
 from typing import Protocol
 
@@ -6,16 +6,12 @@ import numpy as np
 
 from fusion_gym.arrays import Array
 
-_CHUNK = 256  # normals drawn from one position of the counter, at least one step's
+_CHUNK = 256  # normals per counter position, at least one step
 _START, _STEPS, _UNIFORM = range(3)
 
 
 class NoiseSource(Protocol):
-    """Source of the standard normals of episodes, for a batch's ``noise``.
-
-    ``seed`` is a run's seed and ``episode`` counts the run's episodes from 0. A source keeps no
-    state: the same arguments bring the same numbers, whatever was asked before.
-    """
+    """A stateless source of standard normals: equal arguments give equal numbers."""
 
     def start(self, seed: int, episode: int, channels: int) -> Array:
         """Return the normals (channels,) of the episode's start."""
@@ -30,8 +26,8 @@ class NoiseSource(Protocol):
 class PhiloxNoise:
     """The default :class:`NoiseSource`: a Philox generator with the seed as its key.
 
-    The counter's words are the episode, the purpose and the chunk of steps, so any part of an
-    episode is drawn alone. Seeds from 2⁶⁴ on are hashed.
+    The counter's words are the episode, the purpose and the chunk of steps, so every part of an
+    episode is drawn independently of the other parts. Seeds from 2⁶⁴ on are hashed.
 
     Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
     """

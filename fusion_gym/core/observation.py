@@ -1,4 +1,4 @@
-"""Which entries an agent's observation has, by name, and how it is filled."""
+"""The layout of the agent's observation: names, bounds and values of its entries."""
 
 from __future__ import annotations
 
@@ -17,15 +17,21 @@ from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Queue
 from fusion_gym.validation import ConfigurationError
 
-# What is believed is shown by odd functions that tell small differences apart and never saturate
-# where a run was starved.
+# Odd functions of the beliefs: they resolve small differences and do not saturate.
 _DIFFERENCE, _DIFFERENCE_LIMIT = 4.0, 10.0
 _VALUE, _VALUE_LIMIT = 2.0, 20.0
 
 
 class NetworkState(NamedTuple):
-    """The network's side of an observation: ``tokens`` and ``price`` (N,), ``admitted()``
-    (sensors, N) bool, the ``left`` steps of the episode (N,), and the ``queue`` (sensors, N)."""
+    """The network's part of an observation.
+
+    Attributes:
+        tokens: (N,).
+        admitted: Function that returns the admitted sensors (sensors, N) bool.
+        price: Price of a token (N,).
+        left: Remaining steps of the episode (N,).
+        queue: Place of each sensor in the queue (sensors, N).
+    """
 
     tokens: Array
     admitted: Callable[[], NDArray[np.bool_]]
@@ -37,8 +43,12 @@ class NetworkState(NamedTuple):
 class ObservationEntry(NamedTuple):
     """One number of an observation.
 
-    ``sensor`` is the sensor that sees it by itself, under the name ``own_name``; ``broadcast`` says
-    that every sensor does, ``centre`` that the centre knows it.
+    Attributes:
+        name: Name of the entry.
+        own_name: Name in the observation of ``sensor``.
+        sensor: The local sensor that observes the entry, or ``None``.
+        broadcast: Whether every sensor receives it.
+        centre: Whether the centre knows it.
     """
 
     name: str
@@ -49,7 +59,7 @@ class ObservationEntry(NamedTuple):
 
 
 def network_blocks(task: Task) -> tuple[Block, ...]:
-    """What the network adds to a system's own blocks; their values are made of a `Network`."""
+    """Return the network's blocks, whose values are functions of a `NetworkState`."""
     capacity, price = task.bucket.capacity, task.reward.price
     tokens = Block(
         "tokens",
@@ -100,10 +110,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
 
 
 def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
-    """What is believed beyond a system's own blocks, with memory or from what is new alone.
-
-    Their values are made of `Beliefs`.
-    """
+    """Return the blocks of the owner's beliefs, whose values are functions of `Beliefs`."""
     if not task.belief_features:
         return ()
     nominal = task.open_loop if task.nominal_error is None else task.nominal_error[:, None]
@@ -165,16 +172,21 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
 
 
 class ObservationLayout:
-    """Which entries an agent's observation has, by name, and how it is filled.
+    """The names, bounds and values of the entries of an agent's observation.
 
-    ``owner`` says whose memory is shown, where there is one: the scheduler's, or every sensor's
-    own, for a view of its own.
+    Args:
+        task: The task.
+        owner: Owner of the beliefs: ``"scheduler"``, or ``"own"`` for every local sensor.
 
-    ``blocks`` are those that the task's information mode shows, the network's last; ``entries``
-    and ``names`` have one item an entry, ``low`` and ``high`` (entries,) float32 are its bounds.
+    Attributes:
+        blocks: The visible blocks of the task's information mode, the network's last.
+        entries: One :class:`ObservationEntry` per number.
+        names: Names of the entries.
+        low: Lower bounds (entries,) float32.
+        high: Upper bounds (entries,) float32.
 
     Raises:
-        ConfigurationError: two blocks of one name.
+        ConfigurationError: Two blocks have the same name.
     """
 
     def __init__(self, task: Task, owner: Owner = "scheduler") -> None:
@@ -195,24 +207,18 @@ class ObservationLayout:
         self.low, self.high = np.array(bounds, dtype=np.float32).T.copy()
 
     def __reduce__(self) -> tuple[type[ObservationLayout], tuple[Task, Owner]]:
-        """Pickled as the task that it belongs to: the blocks' values are functions."""
+        """Pickle the task and the owner, because the blocks' functions may not be picklable."""
         return ObservationLayout, (self._task, self._owner)
 
     def encode(
         self, state: Any, network: NetworkState, beliefs: Callable[[], Beliefs]
     ) -> NDArray[np.float32]:
-        """Observations (N, entries) float32, clipped to their bounds.
-
-        ``beliefs`` are only looked at where memory is shown.
-
-        Raises:
-            ValueError: a block's value has not the declared shape.
-        """
+        """Return observations (N, entries) float32, clipped to their bounds."""
         filled = [block.fill(state) for block in self._own]
         filled += [block.fill(beliefs()) for block in self._memory]
         filled += [block.fill(network) for block in self._network]
         rows = np.concatenate(filled, dtype=np.float64)
-        with np.errstate(over="ignore"):  # what float32 cannot hold lies beyond every bound
+        with np.errstate(over="ignore"):  # an overflow exceeds every bound
             result = np.ascontiguousarray(rows.T, dtype=np.float32)
         np.maximum(result, self.low, out=result)
         return np.minimum(result, self.high, out=result)
@@ -220,7 +226,7 @@ class ObservationLayout:
     def replace_beliefs(
         self, observation: NDArray[np.float32], beliefs: Beliefs
     ) -> NDArray[np.float32]:
-        """Return observations (N, entries) whose entries of beliefs have this layout's scale."""
+        """Return observations (N, entries) with belief entries in this layout's scale."""
         rows = np.concatenate([block.fill(beliefs) for block in self._memory])
         first = sum(len(block.places) for block in self._own)
         places, result = slice(first, first + len(rows)), observation.copy()
@@ -229,7 +235,7 @@ class ObservationLayout:
 
 
 def block_entries(block: Block) -> list[ObservationEntry]:
-    """The entries of a block, one a number."""
+    """Return the entries of a block."""
     result = []
     for place in block.places:
         own, rest = block.node == "own", place[1:] if block.node == "own" else place

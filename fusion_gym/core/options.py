@@ -1,4 +1,4 @@
-"""What the environments' options have in common, and what an environment makes of them."""
+"""The options that all environments share, and the scenario that an environment builds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
 Action = Literal["binary", "discrete"]
-# What the scale of the reward depends on, beside plant and sensors.
+# Options that affect the scale of the reward, besides plant and sensors.
 _SCALING = (
     "access", "tokens", "token_rate", "token_capacity", "initial_tokens", "token_cost", "sharing",
     "horizon",
@@ -32,13 +32,24 @@ _SCALING = (
 
 @dataclass(frozen=True)
 class CommonOptions:
-    """The options that every environment has; each gives them its own defaults.
+    """Declare the options of every environment; each environment sets its own defaults.
 
-    A field is the declaration of an option: type, default, and the docstring below it. Validation,
-    ``help``, the specification and the tables of the documentation read it. A value that a type
-    ``Literal`` or ``bool`` does not have is refused when the object is made.
-    ``filters`` are the classes behind the values of an option ``filter``, whose docstrings declare
-    them; ``structure`` decides which fusion rules an option ``fusion`` takes.
+    A field declares an option by its type, its default and the docstring below it. Validation,
+    ``help``, the specification and the documentation read this declaration. A value outside a
+    ``Literal`` or ``bool`` type raises an error at construction.
+
+    Attributes:
+        filters: Class of each value of an option ``filter``; its docstring declares the value.
+        structure: Correlation structure, which decides the values of an option ``fusion``.
+
+    Raises:
+        ConfigurationError: A value is not allowed.
+
+    Example:
+        >>> from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
+        >>> options = TobitOscillatorOptions(horizon=50, access="single")
+        >>> options.horizon, options.access, options.information
+        (50, 'single', 'sensors')
     """
 
     filters: ClassVar[Mapping[str, type]] = {}
@@ -46,11 +57,12 @@ class CommonOptions:
 
     access: AccessRule = "any"
     """Rule of medium access. ``"any"`` admits all requests, ``"single"`` the first in the queue.
-    ``"round_robin"`` admits one sensor a step in turn, ``"random"`` one at random. With
-    ``"single"`` the action is ``Discrete(sensors + 1)``: 0 for nobody, m for sensor m - 1."""
+    ``"round_robin"`` admits one sensor per step in turn, ``"random"`` one at random. With
+    ``"single"`` the action space is ``Discrete(sensors + 1)``: 0 is no request, m + 1 is
+    sensor m."""
     tokens: Tokens = "limited"
-    """``"limited"`` applies the token bucket. ``"unlimited"`` grants every request and still counts
-    the tokens spent."""
+    """``"limited"`` applies the token bucket. ``"unlimited"`` grants every request and counts the
+    tokens spent."""
     token_rate: float = 5.0
     """Tokens g that the bucket gains per step (tobit_token_bucket, equation (17))."""
     token_capacity: float = 30.0
@@ -60,77 +72,77 @@ class CommonOptions:
     token_cost: ArrayLike = 3.0
     """Tokens c that a transmission costs: one number, or one per sensor."""
     sharing: SharingRule = "turns"
-    """How simultaneous requests share the tokens. ``"equal"`` gives each sensor the same share: ξ/l
-    ≥ c (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
+    """Rule by which simultaneous requests share the tokens. ``"equal"`` grants if ξ/l ≥ c for l
+    sensors (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
     sensors while tokens last. ``"rotating"`` starts that order one sensor later in each step.
-    ``"turns"`` grants in the order of a queue: a sensor that is granted goes to its end, and a head
-    that the tokens do not pay for blocks those behind it."""
+    ``"turns"`` grants in the order of a queue: a granted sensor goes to its end, and a head that
+    the tokens do not pay for blocks the sensors behind it."""
     packet: Literal["measurement", "estimate"] = "measurement"
-    """Content of a packet. ``"measurement"`` is what the sensor measured or its node estimated.
-    ``"estimate"`` is the centralised scheduler's estimate with its covariance, with ``memory=True``
-    alone."""
+    """Content of a packet. ``"measurement"`` is the sensor's measurement or its node's estimate.
+    ``"estimate"`` is the centralised scheduler's estimate with its covariance and needs
+    ``memory=True``."""
     broadcast: Broadcast | None = None
-    """What every node receives besides tokens and price: nothing, the fusion centre's prediction
-    with its covariance, or every delivered packet. By default ``"estimate"`` where the centre feeds
-    its estimate back, and otherwise ``"none"``."""
+    """Broadcast to every node besides tokens and price: ``"none"``, ``"estimate"`` (the fusion
+    centre's prediction with its covariance) or ``"packets"`` (every delivered packet). The default
+    is ``"estimate"`` where the centre feeds its estimate back, and otherwise ``"none"``."""
     memory: bool = False
-    """Whether measurements that were not sent are remembered, by the centralised scheduler or by
-    each sensor."""
+    """Whether the centralised scheduler, or each local sensor, filters the measurements that were
+    not sent."""
     memory_filter: str | None = None
-    """Filter of the memory, a value of the option ``filter``. By default the fusion centre's, or a
-    better one where that filter minimises a bound."""
+    """Filter of the memory, a value of the option ``filter``. The default is the fusion centre's
+    filter, or a better one where that filter minimises a bound."""
     belief_features: Sequence[Feature] | bool | None = None
-    """What the observation shows of the memory's estimate: its difference from the fusion centre's
-    estimate, and the value of a transmission. ``True`` stands for both, the default with memory."""
+    """Observation entries of the memory's estimate: ``"difference"`` from the fusion centre's
+    estimate and ``"value"`` of a transmission. ``True`` is both, the default with memory."""
     horizon: int = 100
-    """Steps of an episode. The horizon also sets the open-loop level that scales reward and
-    observation."""
+    """Steps of an episode. The open-loop error over the horizon scales reward and observation."""
     clock: bool = False
     """Whether the observation shows the steps left; the end of an episode is then a termination."""
     information: Literal["sensors", "centre"] = "sensors"
-    """What the observation shows: the new measurements of all sensors, or only what the fusion
-    centre knows before anything is sent."""
+    """Content of the observation: the new measurements of all sensors (``"sensors"``), or only the
+    fusion centre's knowledge before any transmission (``"centre"``)."""
     own_number: bool = True
-    """Whether a decentralised sensor observes its own number. Without it, sensors of one kind learn
-    together."""
+    """Whether a local sensor observes its own number. ``False`` makes sensors of one kind
+    indistinguishable to a shared policy."""
     action: Action = "binary"
-    """Action space: one bit per sensor, or the bits as one number with sensor 0 the lowest."""
+    """Action space: one bit u_m per sensor (``"binary"``), or the number Σ u_m 2^m
+    (``"discrete"``)."""
     reward: Literal["scalar", "vector"] = "scalar"
-    """``"scalar"`` pays the sum of the reward's two terms, ``"vector"`` both terms."""
+    """``"scalar"`` returns the sum of the reward's two terms, ``"vector"`` both terms."""
     error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"
-    """Error term of the reward: the squared errors, the diagonal of the claimed covariance (which a
-    policy may be able to game), or the largest weighted squared error. Or a function of errors and
-    covariances, or its ``"module:name"``."""
+    """Error term of the reward: ``"squared"`` is Σ w_i e_i², ``"trace"`` is Σ w_i P_ii of the
+    claimed covariance P (which a policy can exploit), ``"maximum"`` is max w_i e_i². Otherwise a
+    function of errors and covariances, or its ``"module:name"``."""
     error_weight: float = 1.0
     """Weight of the reward's error term."""
     cost_weight: float | Literal["random"] = 0.5
     """Price of a token in the reward. ``"random"`` draws it from ``price_range`` for each episode,
-    evenly in its logarithm."""
+    uniformly in its logarithm."""
     price_range: ArrayLike | Literal["auto"] | None = None
-    """Pair (low, high) of prices. With it the observation shows the price. ``"auto"`` simulates
+    """Pair (low, high) of prices, which adds the price to the observation. ``"auto"`` simulates
     rules: it takes the prices at which the best value of information with memory sends 60 and 12 %
-    of what the bucket sustains, but at least two packets of each sensor in an episode."""
+    of the sustained rate, but at least two packets per sensor and episode."""
     state_weights: ArrayLike | None = None
-    """Weights of the states' squared errors in the reward. By default the environment's own,
+    """Weights of the states' squared errors in the reward. The default is the environment's own,
     which ``help`` shows."""
     reward_scale: float | Literal["auto"] | None = "auto"
     """Factor of the state weights. ``"auto"`` simulates a moderate policy and takes the factor with
-    which its error costs 1 a step; given ``state_weights`` then stay as they are. That policy
-    requests at an even pace: half of what the bucket sustains, or a quarter of all packets where
-    tokens are unlimited. The entries of ``belief_features`` scale by its errors as well. With
-    ``None`` the error without transmissions takes its place."""
+    which its error costs 1 per step; explicit ``state_weights`` are not scaled. That policy
+    requests at an even pace: half of the sustained rate, or a quarter of all packets with unlimited
+    tokens. Its errors also scale the entries of ``belief_features``. ``None`` uses the error
+    without transmissions."""
     true_process_noise: ArrayLike = 1.0
-    """Factor of the true deviation of the process noise. The filters assume 1. A pair (low, high)
-    is drawn from for each episode."""
+    """Factor of the true standard deviation of the process noise. The filters assume 1. A pair
+    (low, high) is a range from which each episode draws."""
     true_measurement_noise: ArrayLike = 1.0
-    """Factor of the true deviation of the measurement noise. The filters assume 1. A pair
-    (low, high) is drawn from for each episode."""
+    """Factor of the true standard deviation of the measurement noise. The filters assume 1. A pair
+    (low, high) is a range from which each episode draws."""
     true_threshold_shift: ArrayLike = 0.0
-    """Shift of the true limits at which sensors are censored. The filters assume 0. A pair
-    (low, high) is drawn from for each episode."""
+    """Shift of the true censoring limits of the sensors. The filters assume 0. A pair (low, high)
+    is a range from which each episode draws."""
     true_transition: ArrayLike = 1.0
     """Factor c of the true motion, from x to x + c (f(x) - x). The filters assume f(x). A pair
-    (low, high) is drawn from for each episode."""
+    (low, high) is a range from which each episode draws."""
 
     def __post_init__(self) -> None:
         if str(self.information) == "local":
@@ -140,7 +152,7 @@ class CommonOptions:
         declaration.check(self)
 
     def nominal(self) -> Self:
-        """Return the options whose simulation scales the reward: plant, sensors and network."""
+        """Return the options that scale the reward: plant, sensors and network."""
         common = (item for item in fields(CommonOptions) if item.name not in _SCALING)
         plain = {item.name: getattr(type(self), item.name) for item in common}
         plain["reward_scale"] = None if self.reward_scale is None else 1.0
@@ -157,17 +169,20 @@ class PaperOptions(CommonOptions):
 
 @dataclass(frozen=True)
 class Scenario:
-    """What an environment makes of its options: all that is its own of a task.
+    """The system and the defaults that an environment builds from its options.
 
-    ``state_weights`` (n,) weigh the squared errors in the reward if the options give none; ``None``
-    weighs all states alike. ``reward_scale`` multiplies them. ``policy_defaults`` are the
-    scenario's own parameters of named policies.
-
-    ``feedback`` says that every node receives the centre's estimate by construction.
-    ``memory_system`` is the system, on the same noise, whose filter remembers what was not sent;
-    ``None`` is the system itself, and with ``nodes_remember`` there is no need of it: every node's
-    packet holds all that the node has ever measured. ``no_estimates`` is why a packet cannot hold
-    an estimate, where it cannot.
+    Args:
+        options: The options.
+        system: The system.
+        state_weights: Weights (n,) of the squared errors in the reward if the options have none;
+            ``None`` weighs all states equally. ``reward_scale`` multiplies them.
+        policy_defaults: Parameters of named policies in this scenario.
+        feedback: Whether every node receives the centre's estimate by construction.
+        memory_system: System on the same noise whose filter processes the unsent measurements;
+            ``None`` is ``system``.
+        nodes_remember: Whether a packet holds all past measurements of its node, so that no
+            ``memory_system`` is needed.
+        no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
     """
 
     options: CommonOptions
@@ -181,7 +196,7 @@ class Scenario:
 
 
 def plain_options(value: Any) -> Any:
-    """Settings as plain lists, numbers and strings, ready for JSON."""
+    """Return settings as plain lists, numbers and strings, ready for JSON."""
     if isinstance(value, dict):
         return {key: plain_options(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

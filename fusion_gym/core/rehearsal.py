@@ -1,4 +1,4 @@
-"""A few steps of a task before it is handed out: what float64 cannot hold shows at once."""
+"""A short simulation of a task that detects numbers beyond float64."""
 
 import numpy as np
 
@@ -10,11 +10,7 @@ _STEPS = 8
 
 
 def rehearse(task: Task) -> None:
-    """Three runs: one in which nobody requests, one with all requests, one with every other one.
-
-    Raises:
-        ConfigurationError: an observation, estimate or reward that is not finite.
-    """
+    """Check that runs without, with all and with alternating requests remain finite."""
     sensors = np.arange(task.sensors)
     try:
         batch = EpisodeBatch.seeded(task, 3, seed=0)

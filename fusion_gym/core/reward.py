@@ -1,4 +1,4 @@
-"""What the answer is worth: the error, and the price of a token."""
+"""The reward: the error term and the price of tokens."""
 
 from __future__ import annotations
 
@@ -19,22 +19,18 @@ from fusion_gym.validation import ConfigurationError
 Cost = Callable[[Array, Array], Any]  # of errors (n, N) and covariances (n, n, N)
 ERROR_KINDS: tuple[str, ...] = get_args(ErrorKind)
 TRAINING_ERRORS = ("squared", "excess", "mismatch")
-_LARGEST = 1e32  # of squares on average: rewards are also handed on as float32
+_LARGEST = 1e32  # mean square; rewards become float32
 
 
 def equal_weights(open_loop: Array) -> Array:
-    """Weights (n,) by which every state counts alike and open loop (n,) costs one.
-
-    Raises:
-        ConfigurationError: a state that is known without any transmission.
-    """
+    """Return weights 1/(n vᵢ) (n,) of open-loop variances vᵢ, so that open loop costs 1."""
     if np.any(open_loop <= 0.0):
         raise _at_rest(open_loop)
     return 1.0 / (len(open_loop) * open_loop)
 
 
 def _at_rest(open_loop: Array) -> ConfigurationError:
-    """The error of a plant some of whose states are known without any transmission."""
+    """Return the error of a plant with a state that is known without transmissions."""
     return ConfigurationError(
         f"a squared error of {validation.display(open_loop)} without transmissions is not allowed: "
         "every state must be moved by noise before the horizon, or be uncertain at the start"
@@ -42,11 +38,7 @@ def _at_rest(open_loop: Array) -> ConfigurationError:
 
 
 def _cost(error: str | Cost, states: int) -> str | Cost:
-    """A kind as it is, or the function that ``error`` is or names, tried out on some errors.
-
-    Raises:
-        ConfigurationError: neither, or a function that cannot be imported or is of another kind.
-    """
+    """Return the error kind, or the function of ``error`` after a test on sample errors."""
     own = import_named("error", error) if isinstance(error, str) and ":" in error else error
     if own not in ERROR_KINDS if isinstance(own, str) else not callable(own):
         listed = ", ".join(repr(kind) for kind in ERROR_KINDS)
@@ -61,7 +53,7 @@ def _cost(error: str | Cost, states: int) -> str | Cost:
             _own_cost(own, name, errors, errors[:, None] * np.eye(states)[:, :, None])
         except ConfigurationError:
             raise
-        except Exception as reason:  # whatever its own code raises
+        except Exception as reason:  # a user's function may raise any exception
             text = " ".join(f"{type(reason).__name__}: {reason}".split())
             raise ConfigurationError(
                 f"error = {name!r} is not allowed: it must take errors (n, N) and covariances "
@@ -71,7 +63,7 @@ def _cost(error: str | Cost, states: int) -> str | Cost:
 
 
 def _own_cost(function: Cost, name: str, error: Array, covariance: Array) -> Array:
-    """What a function of one's own returns, checked; ``name`` is what an error calls it."""
+    """Return the checked values of a user's function."""
     values = np.asarray(function(error, covariance), dtype=np.float64)
     if values.shape != error.shape[1:] or not np.all(values >= 0.0):
         raise ConfigurationError(
@@ -84,12 +76,17 @@ def _own_cost(function: Cost, name: str, error: Array, covariance: Array) -> Arr
 
 @dataclass(frozen=True)
 class Reward:
-    """reward = -(error_weight · D + price · tokens spent), D what an error costs.
+    """reward = -(error_weight · D + price · tokens), with D the cost of the error.
 
-    ``error="squared"`` takes D = Σᵢ wᵢ eᵢ² of the error e of the fused estimate, ``"maximum"``
-    D = maxᵢ wᵢ eᵢ², ``"trace"`` D = Σᵢ wᵢ Pᵢᵢ of the covariance P as the filter claims it (which a
-    policy can game, see the documentation). A function takes e (n, N) = truth - estimate and
-    P (n, n, N), and returns D (N,) >= 0; the weights w, of shape (n, 1), are not in it.
+    The error e (n, N) is the truth minus the fused estimate, P (n, n, N) its claimed covariance.
+
+    Args:
+        error: ``"squared"`` is D = Σᵢ wᵢ eᵢ², ``"maximum"`` D = maxᵢ wᵢ eᵢ², ``"trace"`` D = Σᵢ wᵢ
+            Pᵢᵢ, which a policy can exploit. A function takes e and P and returns D (N,) >= 0
+            without the weights w.
+        error_weight: Weight of the error term.
+        price: Price of a token.
+        state_weights: Weights w (n, 1).
     """
 
     error: str | Cost
@@ -106,15 +103,19 @@ class Reward:
         state_weights: ArrayLike | None,
         open_loop: Array,
     ) -> Reward:
-        """Check the weights; ``None`` weighs all states alike so that open loop costs 1.
+        """Return a reward with checked weights.
 
-        ``error`` is a kind, a function, or ``module:name`` of one. ``open_loop`` (n,) is the mean
-        error variance of each state without any transmission.
+        Args:
+            error: A kind, a function, or its ``module:name``.
+            error_weight: Weight of the error term.
+            price: Price of a token.
+            state_weights: Weights (n,); ``None`` weighs all states equally so that open loop costs
+                1.
+            open_loop: Mean error variance (n,) of each state without any transmission.
 
         Raises:
-            ConfigurationError: an unknown kind, a function that cannot be imported, a negative
-                weight, a wrong shape, or weights that make of the error without transmissions more
-                than can be worked with.
+            ConfigurationError: The kind is unknown, the function cannot be imported, a weight is
+                negative or has a wrong shape, or the open-loop cost exceeds the limit.
         """
         if state_weights is None and not open_loop.sum() > 0.0:
             raise _at_rest(open_loop)
@@ -139,19 +140,22 @@ class Reward:
 
     @property
     def error_kind(self) -> str:
-        """The kind of the error's term, or the name of its function."""
+        """Kind of the error term, or the name of its function."""
         return self.error if isinstance(self.error, str) else name_of(self.error)
 
     def terms(
         self, error: Array, covariance: Array, spent: Array, price: Array
     ) -> tuple[Array, Array]:
-        """The two terms of the reward (N,), both <= 0: error and cost.
+        """Return the two terms of the reward (N,), both <= 0: error and tokens.
 
-        From errors (n, N), the fused covariance (n, n, N), tokens spent (N,) and the price of a
-        token (N,).
+        Args:
+            error: Truth minus fused estimate (n, N).
+            covariance: Fused covariance (n, n, N).
+            spent: Tokens (N,).
+            price: Price of a token (N,).
 
         Raises:
-            ConfigurationError: a function of one's own returns no numbers >= 0 of shape (N,).
+            ConfigurationError: A user's function returns no numbers >= 0 of shape (N,).
         """
         return -self.error_weight * self._error_cost(error, covariance), -price * spent
 
@@ -166,13 +170,18 @@ class Reward:
         return _own_cost(self.error, self.error_kind, error, covariance)
 
     def training_error(self, kind: str, error: Array, reference_error: Array) -> Array:
-        """The error's term of the reward (…,) to train with, of errors (n, …): truth - estimate.
+        """Return the error term (…,) of the reward for training, weighted.
 
-        With x̂ the fused estimate, and x* the one that takes in every measurement, whose error is
-        ``reference_error`` (n, …): ``"squared"`` is ‖x - x̂‖², ``"excess"`` ‖x - x̂‖² - ‖x - x*‖²,
-        which differs by what no policy can change, ``"mismatch"`` ‖x* - x̂‖², all weighted. If x*
-        is the conditional mean given all that x̂ and the policy use, the last two have the same
-        mean, and the mismatch the least noise.
+        With x̂ the fused estimate and x* the full-information estimate, ``"squared"`` is ‖x - x̂‖²,
+        ``"excess"`` is ‖x - x̂‖² - ‖x - x*‖² and ``"mismatch"`` is ‖x* - x̂‖². No policy changes
+        the second term of the excess. If x* is the conditional mean given everything that x̂ and
+        the policy use, excess and mismatch have the same mean, and the mismatch has the smaller
+        variance.
+
+        Args:
+            kind: ``"squared"``, ``"excess"`` or ``"mismatch"``.
+            error: x - x̂ (n, …).
+            reference_error: x - x* (n, …).
         """
         if kind == "mismatch":
             squared = (error - reference_error) ** 2
@@ -186,11 +195,12 @@ class Reward:
 
 @dataclass(frozen=True)
 class Price:
-    """What a token costs in the reward.
+    """The price of a token in the reward.
 
-    ``fixed`` is the price, or ``None`` where each episode draws its own, evenly in the logarithm,
-    from ``span`` (low, high). With a span the observation shows the price, so that one agent can
-    learn the whole trade-off between error and transmissions.
+    Args:
+        fixed: The price; ``None`` draws one per episode from ``span``, uniformly in the logarithm.
+        span: Range (low, high), with which the observation shows the price; ``None`` without a
+            range.
     """
 
     fixed: float | None
@@ -198,11 +208,15 @@ class Price:
 
     @classmethod
     def create(cls, cost_weight: Any, price_range: Any = None) -> Price:
-        """The options ``cost_weight`` (a number >= 0 or "random") and ``price_range``.
+        """Return the price of the options.
+
+        Args:
+            cost_weight: A number >= 0 or ``"random"``.
+            price_range: Pair (low, high) or ``None``.
 
         Raises:
-            ConfigurationError: a negative price, a range that is not 0 < low < high, a random
-                price without a range, or a fixed one outside its range.
+            ConfigurationError: The price is negative or outside its range, the range is not
+                0 < low < high, or a random price has no range.
         """
         span = None if price_range is None else _span(price_range)
         if isinstance(cost_weight, str):
@@ -221,29 +235,28 @@ class Price:
         return cls(price, span)
 
     def draw(self, uniform: Array) -> Array:
-        """Prices (N,) from uniform numbers in [0, 1); fixed ones do not depend on them."""
+        """Return prices (N,) from uniform numbers in [0, 1); a fixed price ignores them."""
         if self.fixed is not None or self.span is None:
             return np.full(uniform.shape, self.fixed)
         low, high = self.span
         return low * (high / low) ** uniform
 
     def encode(self, price: Array) -> Array:
-        """Position of the price in the range, 0 to 1 in the logarithm; same shape.
-
-        Raises:
-            ConfigurationError: there is no range.
-        """
+        """Return the position of prices in the logarithmic range, from 0 to 1."""
         if self.span is None:
             raise ConfigurationError("price_range = None is not allowed here: no price is observed")
         low, high = self.span
         return np.log(price / low) / math.log(high / low)
 
     def scale(self, price: Array, exponent: float) -> Array:
-        """(geometric mean of the range / price)^exponent, same shape; 1 without a range.
+        """Return (geometric mean of the range / price)^exponent, or 1 without a range.
 
-        Multiplying an episode's rewards by it changes no policy that is best for its price, and
-        brings what a decision is worth at low and at high prices closer together: at a price p the
-        decisions that are hard to make are worth about p.
+        The factor does not change the best policy of a price. It makes the values of decisions at
+        low and high prices comparable, because close decisions at price p differ by about p.
+
+        Args:
+            price: Prices.
+            exponent: From 0 to 1.
         """
         if self.span is None:
             return np.ones(price.shape)

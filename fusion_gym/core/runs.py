@@ -1,7 +1,6 @@
-"""N runs of a task at one time: what is known of them, and the two halves of a step.
+"""N runs of a task at one time, and the two halves of a step.
 
-Both halves are pure: they make new arrays and change none, so runs can be taken apart from those
-that they began as and moved on other noise.
+Both halves make new arrays and change none, so runs can branch on other noise.
 """
 
 from __future__ import annotations
@@ -22,14 +21,20 @@ from fusion_gym.core.token_bucket import Grants, Queue
 
 
 class Outcome(NamedTuple):
-    """What one step brought, batch axis last.
+    """The results of one step, batch axis last.
 
-    ``reward`` (N,) is ``reward_error`` + ``reward_communication``; ``cost`` (N,) the tokens spent;
-    ``requested``, ``granted`` (sensors, N) bool; ``error`` (n, N) of the fused estimate, the truth
-    minus it, and ``squared_error``;
-    ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
-    ``divergence_level``; ``ended`` (N,) bool, whether
-    the episode is over.
+    Attributes:
+        reward: (N,), the sum of both terms.
+        reward_error: Error term (N,).
+        reward_communication: Token term (N,).
+        cost: Tokens spent (N,).
+        requested: (sensors, N) bool.
+        granted: (sensors, N) bool.
+        error: Truth minus fused estimate (n, N).
+        squared_error: (n, N).
+        diverged: (N,) bool, whether a squared error is not finite or exceeds the task's
+            ``divergence_level``.
+        ended: (N,) bool, whether the episode is over.
     """
 
     reward: Array
@@ -45,11 +50,16 @@ class Outcome(NamedTuple):
 
 
 class Position(NamedTuple):
-    """Where N runs are, after sensing: all that moves with them.
+    """The state of N runs after sensing.
 
-    The system's ``state``, ``tokens`` and ``price`` (N,), ``steps`` taken and the ``limit`` at
-    which the episode ends (N,), the bucket's ``queue`` (sensors, N), and who is ``admitted`` in the
-    coming step (sensors, N) bool.
+    Attributes:
+        state: The system's state.
+        tokens: (N,).
+        price: Price of a token (N,).
+        steps: Steps taken (N,).
+        limit: Step at which the episode ends (N,).
+        queue: Place of each sensor in the queue (sensors, N).
+        admitted: Sensors that the access rule admits in the coming step (sensors, N) bool.
     """
 
     state: Any
@@ -64,9 +74,18 @@ class Position(NamedTuple):
 class Runs:
     """N runs of a :class:`~fusion_gym.core.task.Task` at one time, after sensing.
 
-    ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
-    for metrics and figures; ``memory`` moves along beside them; ``tokens``, ``price`` of a token
-    and ``steps`` taken are (N,); ``queue`` (sensors, N) is the token bucket's.
+    Args:
+        task: The task.
+        memory: Memory, which moves with the runs.
+        layout: Layout of the observation.
+
+    Attributes:
+        state: The system's state after sensing.
+        delivered: The system's state after the last delivery, for metrics and figures.
+        tokens: (N,).
+        price: Price of a token (N,).
+        steps: Steps taken (N,).
+        queue: Place of each sensor in the queue (sensors, N).
     """
 
     state: Any
@@ -82,11 +101,11 @@ class Runs:
 
     @property
     def channels(self) -> int:
-        """Standard normals of one step: the system's, and one for ``access="random"``."""
+        """Number of standard normals of a step: the system's, and one for ``access="random"``."""
         return self.task.system.noise_channels + (self.task.access == "random")
 
     def deliver(self, requests: NDArray[np.bool_]) -> Outcome:
-        """The first half of a step: answer the requests (sensors, N), update, fuse, reward."""
+        """Make the first half of a step with requests (sensors, N): grant, update, fuse, reward."""
         task, system = self.task, self.task.system
         granted, spent, tokens, self.queue = self.answer(requests)
         state = self.memory.deliver(self.state, system.deliver(self.state, granted), granted)
@@ -111,7 +130,7 @@ class Runs:
     def answer(
         self, requests: NDArray[np.bool_], runs: NDArray[np.int64] | slice = slice(None)
     ) -> Grants:
-        """The network's answer to requests (sensors, R), each of one of the R ``runs``."""
+        """Return the grants for requests (sensors, R) of the R ``runs``."""
         steps, queue = self.steps[runs], self.queue[:, runs]
         if self.task.access == "single":
             requests = first_request(requests, queue)
@@ -120,24 +139,24 @@ class Runs:
         return self.task.bucket.grant(self.tokens[runs], requests, steps, queue)
 
     def sense(self, noise: Array) -> None:
-        """The second half: the plant moves, the sensors measure, with noise (channels, N)."""
+        """Make the second half of a step: move the plant and measure, with noise (channels, N)."""
         noise = noise[: self.task.system.noise_channels]
         self.memory.sense(noise)
         self.state = self.task.system.sense(self.delivered, noise)
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
-        """The given runs (all by default), in this order and possibly again and again, apart.
-
-        Runs that are finished go on from their continued state.
-        """
+        """Return independent copies of ``runs``, possibly repeated, by default of all."""
         memory = self.memory.branch(runs, len(self.steps))
         return Branch(self.task, memory, self.layout, self._position(runs))
 
     def branch_memory(self, runs: NDArray[np.int64]) -> Branch:
-        """As :meth:`branch`, of a scheduler's runs whose x* is known and no longer computed.
+        """Return independent runs of a scheduler whose x* is known.
 
-        What a scheduler remembers does not depend on what is sent: x* after a step is that of
-        the runs that these were taken from, and has to be given to :meth:`Branch.step`.
+        The scheduler's memory does not depend on transmissions, so x* after a step is the original
+        runs' x*, an argument of :meth:`Branch.step`.
+
+        Args:
+            runs: Numbers of the runs.
         """
         position = self._position(runs)
         memory = self.memory.with_best(position.state, take_runs(self.beliefs().best, runs))
@@ -165,32 +184,31 @@ class Runs:
         )
 
     def observe(self) -> NDArray[np.float32]:
-        """Observations (N, entries) of all runs, a fresh array."""
+        """Return new observations (N, entries) of all runs."""
         left = (self._limit - self.steps).astype(np.float64)
         network = NetworkState(self.tokens, self.admitted, self.price, left, self.queue)
         return self.layout.encode(self.state, network, self.beliefs)
 
     def beliefs(self) -> Beliefs:
-        """What the owner of the memory believes before anything is sent."""
+        """Return the beliefs of the memory's owner before any transmission."""
         return self.memory.beliefs(self.state)
 
     def admitted(self) -> NDArray[np.bool_]:
-        """The sensors (sensors, N) that the network's access rule admits in the coming step."""
+        """Return the sensors (sensors, N) that the access rule admits in the coming step."""
         return access_mask(self.task.access, self.task.sensors, self.steps, self._lottery())
 
     def grantable(self) -> NDArray[np.bool_]:
-        """The sensors (sensors, N) whose request alone the network would grant now."""
+        """Return the sensors (sensors, N) whose single request the network would grant now."""
         return np.asarray(self.admitted() & self.task.bucket.affordable(self.tokens))
 
     def signals(self) -> Signals:
-        """The signals of all runs, without what the information mode withholds.
+        """Return the signals of all runs, except those that the information mode withholds.
 
-        To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
-        a token, ``step`` (N,), the steps taken in the episode, ``queue`` (sensors, N), each
-        sensor's place in the queue, 0 for who was granted least recently, ``start`` (N,) bool,
-        ``admitted`` and ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and
-        ``model``, the system's state without what no policy may know, for policies that plan with
-        the system's own moves; and the beliefs (:mod:`fusion_gym.core.signals`).
+        The system's signals are extended by ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price``
+        (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor granted least
+        recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N) bool,
+        ``observation`` (N, entries), ``model`` (the system's state from :meth:`System.visible
+        <fusion_gym.core.system.System.visible>`) and the beliefs (:mod:`fusion_gym.core.signals`).
         """
         system, state = self.task.system, self.state
         values = dict(system.read(state))
@@ -210,15 +228,12 @@ class Runs:
         return Signals(values, self.task.hidden_signals, self.memory.missing_signals)
 
     def _lottery(self) -> Array | None:
-        """The standard normals (N,) that decide random access; None with another rule."""
+        """Return the standard normals (N,) for random access, or ``None`` with another rule."""
         return None
 
 
 class Branch(Runs):
-    """Runs of their own from a :class:`Position` on, with whatever noise they are given.
-
-    It shares arrays with what it was taken from and never changes one.
-    """
+    """Independent runs that start at a :class:`Position` and take any noise; arrays are shared."""
 
     def __init__(
         self,
@@ -234,9 +249,12 @@ class Branch(Runs):
     def step(
         self, requests: NDArray[np.bool_], noise: Array, best: Estimate | None = None
     ) -> Outcome:
-        """Both halves of a step, with standard normals (channels, N).
+        """Make both halves of a step.
 
-        ``best`` is x* after the step, for runs that were taken by :meth:`Runs.branch_memory`.
+        Args:
+            requests: (sensors, N) bool.
+            noise: Standard normals (channels, N).
+            best: x* after the step, for runs of :meth:`Runs.branch_memory`.
         """
         outcome = self.deliver(requests)
         self.sense(noise)
@@ -245,11 +263,11 @@ class Branch(Runs):
         return outcome
 
     def sense(self, noise: Array) -> None:
-        """See :class:`Runs`."""
+        """Make the second half of a step with noise (channels, N)."""
         super().sense(noise)
         lottery = noise[-1] if self.task.access == "random" else None
         self._admitted = access_mask(self.task.access, self.task.sensors, self.steps, lottery)
 
     def admitted(self) -> NDArray[np.bool_]:
-        """See :class:`Runs`."""
+        """Return the sensors (sensors, N) that the access rule admits in the coming step."""
         return self._admitted

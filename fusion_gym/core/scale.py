@@ -1,6 +1,6 @@
-"""What the options' ``"auto"`` stands for: the scale of a reward, and the prices that matter.
+"""The values of ``"auto"`` options: the scale of the reward, and the range of prices.
 
-Both are found by seeded simulations of the plant as assumed, whatever its filter, each once.
+Seeded simulations of the assumed plant determine both; each simulation runs once.
 """
 
 import json
@@ -23,20 +23,15 @@ from fusion_gym.errors import ConfigurationError, display
 Build = Callable[[Any], Scenario]
 _RUNS, _STEPS, _SEED = 32, 200, 20_261_124
 _WORK = 200  # sensors · states² up to which a sweep has all its rules and runs
-# A pace that comes up at a step may be computed a rounding below it: 49 · (1/49) < 1.
+# Allowance for rounding, because 49 · (1/49) < 1.
 _ROUNDING = 1e-9
-# Of the packets that the tokens sustain, at the lowest and at the highest price; packets of a
-# sensor in an episode.
+# Shares of the sustained packets at the lowest and highest price; packets per sensor and episode.
 _MOST, _LEAST, _PACKETS = 0.6, 0.12, 2.0
 _STORED: dict[tuple[Any, ...], Any] = {}
 
 
 def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array | None]:
-    """Return the options with numbers for ``"auto"``, and the nominal error where one scales.
-
-    Raises:
-        ConfigurationError: a value that is not allowed, or a plant that has no such number.
-    """
+    """Return the options with numbers for ``"auto"``, and the nominal error or ``None``."""
     error, factor = None, options.reward_scale
     if factor is not None:
         error, whole = _stored(_nominal, options.nominal(), build)
@@ -65,27 +60,23 @@ def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array 
 
 
 def nominal_rate(bucket: TokenBucket, access: str) -> float:
-    """Return packets a sensor and step: half of what the tokens sustain, or a quarter of all."""
+    """Return packets per sensor and step: half of the sustained rate, or a quarter if unlimited."""
     return sustained_rate(bucket, access) / (4.0 if bucket.unlimited else 2.0)
 
 
 def sustained_rate(bucket: TokenBucket, access: str) -> float:
-    """Return the packets a sensor and step that the network sustains."""
+    """Return the packets per sensor and step that the network sustains."""
     most = 1.0 if access == "any" else 1.0 / len(bucket.cost)
     return most if bucket.unlimited else min(most, bucket.rate / float(bucket.cost.sum()))
 
 
 def sustained_tokens(task: Task) -> float:
-    """Return the tokens a step that the network lets all sensors spend for long."""
+    """Return the tokens per step that the network lets all sensors spend in the long run."""
     return sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
 
 
 def nominal_error(task: Task) -> Array:
-    """Return each state's mean squared error (n,) where sensors request at an even pace.
-
-    A sensor requests when its pace has come up and the network's access rule admits it. Where no
-    packet is sustained, these are the errors without transmissions.
-    """
+    """Return each state's mean squared error (n,) with requests at an even pace."""
     rate, sensors = nominal_rate(task.bucket, task.access), task.sensors
     if rate == 0.0:
         return task.open_loop[:, 0]
@@ -101,13 +92,13 @@ def nominal_error(task: Task) -> Array:
 
 
 def price_range(task: Task) -> tuple[float, float]:
-    """Return the prices at which value of information sends 60 and 12 % of what is sustained.
+    """Return the prices at which value of information sends 60 and 12 % of the sustained rate.
 
-    At least two packets of each sensor in an episode. At each price that is the rule with the
+    The lower rate is at least two packets per sensor and episode. Each price belongs to the
     threshold of the least cost: prices are slopes of the lower envelope of error against tokens.
 
-    Raises:
-        ConfigurationError: no transmission lowers the error.
+    Args:
+        task: The task.
     """
     sustained = sustained_tokens(task)
     least = _PACKETS * float(task.bucket.cost.sum()) / task.horizon
@@ -117,13 +108,7 @@ def price_range(task: Task) -> tuple[float, float]:
 
 
 def prices_at(spent: Array, error: Array, tokens: Array) -> Array:
-    """Return the prices at which the best of some policies spends these tokens.
-
-    ``spent`` and ``error`` (policies,) are per step; prices are slopes of their lower envelope.
-
-    Raises:
-        ConfigurationError: no policy that transmits has a lower error.
-    """
+    """Return the slopes of the lower envelope where the best policy spends ``tokens``."""
     spent, error = _envelope(spent, error)
     if len(spent) < 3:
         raise ConfigurationError(
@@ -140,11 +125,7 @@ def _nominal(task: Task) -> tuple[Array, float]:
 
 
 def _sweep(task: Task) -> tuple[Array, Array]:
-    """Tokens and error a step (rules,) of value of information, on the same noise.
-
-    Of rising thresholds, each with at most 1, 2, 4, … sensors a step; fewer of all on a plant whose
-    steps take long.
-    """
+    """Return tokens and error per step (rules,) of value-of-information rules on the same noise."""
     share = _WORK / (task.sensors * len(task.open_loop) ** 2)
     runs = int(np.clip(_RUNS * share, 4, _RUNS))
     ratio, count = (2, 21) if runs > 4 else (4, 9)
@@ -165,7 +146,7 @@ def _sweep(task: Task) -> tuple[Array, Array]:
 
 
 def _envelope(spent: Array, error: Array) -> tuple[Array, Array]:
-    """The vertices of the lower convex envelope, from the fewest tokens to the least error."""
+    """Return the vertices of the lower convex envelope, in the order of rising tokens."""
     vertices: list[int] = []
     for point in np.lexsort((error, spent)).tolist():
         while len(vertices) > 1 and _above(vertices[-2], vertices[-1], point, spent, error):
@@ -176,13 +157,13 @@ def _envelope(spent: Array, error: Array) -> tuple[Array, Array]:
 
 
 def _above(left: int, middle: int, right: int, spent: Array, error: Array) -> bool:
-    """Whether the middle point lies on or above the chord of the others."""
+    """Return whether the middle point lies on or above the chord of the others."""
     rise = (error[middle] - error[left]) * (spent[right] - spent[left])
     return bool(rise >= (error[right] - error[left]) * (spent[middle] - spent[left]))
 
 
 def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
-    """A batch of as many copies of the simulation's runs."""
+    """Return a batch of ``copies`` copies of the simulation's runs."""
     batch = EpisodeBatch(replace(task, horizon=min(task.horizon, _STEPS)), runs * copies)
     seeds = np.tile(np.arange(_SEED, _SEED + runs), copies)
     batch.seed(np.arange(len(seeds)), seeds.tolist())
@@ -191,7 +172,7 @@ def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
 
 
 def _stored(simulate: Callable[[Task], Any], options: CommonOptions, build: Build) -> Any:
-    """The result of a simulation of options, which runs once."""
+    """Return the cached result of a simulation of options."""
     key = simulate, build, json.dumps(plain_options(asdict(options)))
     if key not in _STORED:
         with warnings.catch_warnings():
@@ -201,7 +182,7 @@ def _stored(simulate: Callable[[Task], Any], options: CommonOptions, build: Buil
 
 
 def _rounded(value: float) -> float:
-    """To three digits, so that another machine finds the same."""
+    """Round to three digits, so that all machines give the same value."""
     return float(f"{value:.3g}")
 
 

@@ -1,4 +1,4 @@
-"""What is believed, as signals by name, beside those that a system offers itself."""
+"""The signals of the beliefs, in addition to a system's own signals."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.system import Signal
 
-# Knowledge as in a task with memory; without it these need no more than "scheduler" and "own".
+# Knowledge in a task with memory; without memory "scheduler" and "own" suffice.
 MEMORY_SIGNALS = (
     Signal(
         "belief_difference",
@@ -35,10 +35,7 @@ _EVERY = ("beliefs", "belief_difference", "transmission_value")
 
 
 def memory_signals(owner: Owner, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
-    """The values of those of ``MEMORY_SIGNALS`` that are the owner's, and the beliefs themselves.
-
-    The latter are for policies that plan.
-    """
+    """Return the owner's beliefs and ``MEMORY_SIGNALS`` by name, as functions."""
     if owner == "own":
         values = (beliefs, lambda: beliefs().difference, lambda: beliefs().value())
         return dict(zip(_OWN, values, strict=True))
@@ -47,7 +44,7 @@ def memory_signals(owner: Owner, beliefs: Callable[[], Beliefs]) -> Mapping[str,
 
 
 def missing_signals(owner: Owner) -> Mapping[str, str]:
-    """What is believed by others than the owner of a batch's memory, and why it is not there."""
+    """Return the names of another owner's signals, and the reason for their absence."""
     why = (
         "is not there, for this batch does not keep what it needs: a policy that looks at what is "
         "believed declares whose beliefs as an attribute, remember = 'scheduler' or 'own'"

@@ -1,6 +1,6 @@
-"""What the environments ask of a system: its moves, its signals and observation, who knows them.
+"""The interface of a system: dynamics, signals, observation blocks, and their knowledge classes.
 
-Who knows what is one order, for signals, observations, policies and fair comparisons alike.
+One partial order of knowledge classes serves signals, observations and policies.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MEANING: dict[Knowledge, str] = {
     "own_memory": "the same as own, and what that sensor measured and did not send",
     "scheduler_memory": "the same as scheduler, and what all sensors measured and did not send",
 }
-# What each class knows besides itself.
+# Classes that each class covers besides itself.
 _BELOW: dict[Knowledge, tuple[Knowledge, ...]] = {
     "clock": (),
     "centre": ("clock",),
@@ -44,13 +44,17 @@ _BELOW: dict[Knowledge, tuple[Knowledge, ...]] = {
 
 
 def covers(knower: Knowledge, known: Knowledge) -> bool:
-    """Whether whoever has the class ``knower`` knows all that belongs to the class ``known``.
+    """Return whether the class ``knower`` knows everything that the class ``known`` knows.
 
-    clock < centre and own < scheduler, and own and scheduler also with memory; centre and own
-    do not cover each other.
+    clock < centre < scheduler and clock < own < scheduler; centre and own are not comparable. A
+    class with memory covers the same class without it.
+
+    Args:
+        knower: A class of ``KNOWLEDGE``.
+        known: A class of ``KNOWLEDGE``.
 
     Raises:
-        ConfigurationError: an unknown class.
+        ConfigurationError: A class is unknown.
     """
     for name, value in (("knower", knower), ("known", known)):
         validation.choice(name, value, KNOWLEDGE)
@@ -58,7 +62,7 @@ def covers(knower: Knowledge, known: Knowledge) -> bool:
 
 
 def least_covering(classes: Iterable[Knowledge]) -> Knowledge:
-    """The least class that covers all the given ones; ``"clock"`` for none."""
+    """Return the least class that covers all ``classes``; ``"clock"`` for none."""
     required = tuple(classes)
     able = [k for k in KNOWLEDGE if all(covers(k, item) for item in required)]
     return min(able, key=lambda k: len(_BELOW[k]))
@@ -72,13 +76,16 @@ PredictionT = TypeVar("PredictionT")
 
 @dataclass(frozen=True)
 class Signal:
-    """A named quantity that a policy may look at: who knows it, its axes, and what it is.
+    """A named quantity that a policy may use.
 
-    ``knowledge`` is ``"own"`` for what only the sensor knows before anything is sent (its new
-    measurement and all that follows from it), ``"centre"`` for what the fusion centre knows as
-    well, ``"clock"`` for what time alone tells. ``axes`` names the axes, as in
-    ``"(sensors, m, N)"``; an array has as many, the batch axis N last. ``joint`` marks a row a
-    sensor that no sensor knows, for it depends on the others.
+    Args:
+        name: Name of the signal.
+        knowledge: Least class that knows it before any transmission: ``"own"`` for a sensor's new
+            measurement and its consequences, ``"centre"`` for the fusion centre's knowledge,
+            ``"clock"`` for the time.
+        axes: Axes of the array, such as ``"(sensors, m, N)"``, the batch axis N last.
+        meaning: Short description.
+        joint: Whether a sensor's row depends on other sensors, so that the sensor does not know it.
     """
 
     name: str
@@ -88,7 +95,7 @@ class Signal:
     joint: bool = False
 
     def known_to(self, knower: Knowledge) -> bool:
-        """Return whether a policy of this class may read it; a sensor reads its own row, too."""
+        """Return whether a policy of this class may read the signal, or a sensor its row."""
         node = self.knowledge == "centre" and self.axes.startswith("(sensors") and not self.joint
         return covers(knower, self.knowledge) or (node and covers(knower, "own"))
 
@@ -96,7 +103,7 @@ class Signal:
         validation.choice("knowledge", self.knowledge, KNOWLEDGE)
 
 
-# The signals of every system, and what they are where the system does not say otherwise.
+# The signals of every system with their default meanings.
 _COMMON: tuple[tuple[str, Knowledge, str], ...] = (
     ("measurement", "own", "the new measurement"),
     ("innovation", "own", "measurement minus its expectation"),
@@ -121,7 +128,9 @@ _COMMON_AXES = {
 def common_signals(axes: str = "(sensors, m, N)", **meanings: str) -> tuple[Signal, ...]:
     """Return the signals that every system offers.
 
-    ``axes`` are those of a measurement; ``meanings`` replace the general ones by name.
+    Args:
+        axes: Axes of a measurement.
+        **meanings: Descriptions by signal, which replace the general ones.
     """
     return tuple(
         Signal(n, k, _COMMON_AXES.get(n, axes), meanings.get(n, text), n == "variance_reduction")
@@ -131,18 +140,34 @@ def common_signals(axes: str = "(sensors, m, N)", **meanings: str) -> tuple[Sign
 
 @dataclass(frozen=True)
 class Block:
-    """Entries of an agent's observation, all that there is to know of them in one place.
+    """Declare a named group of entries of the agent's observation.
 
-    ``labels`` has the labels of each axis: ``(("0", "1"), ("x1", "x2"))`` names the entries
-    ``name[0,x1]``, ``name[0,x2]``, …, and no axes at all the one entry ``name``. ``value`` takes a
-    state after sensing and returns the entries, scaled to order one, as an array of the labels'
-    shape and N runs; they are clipped to ±``limit``, or without a limit to 0..1. ``constants`` are
-    the numbers that ``meaning`` speaks of, by its own words, mostly one for each label of the last
-    axes.
+    Entries are clipped to ±``limit``, or without a limit to [0, 1].
 
-    ``knowledge`` is the least class that knows the block before anything is sent; ``node`` is what
-    a sensor sees of it by itself: its own row of the first axis (``"own"``), all of it, for the
-    centre tells everyone (``"broadcast"``), or nothing (``"hidden"``).
+    Args:
+        name: Name of the block.
+        meaning: Short description or formula.
+        value: Function of a state after sensing. It returns the entries, scaled to order one, with
+            the shape of the labels and N runs.
+        labels: Labels of each axis. ``(("0", "1"), ("x1", "x2"))`` names the entries
+            ``name[0,x1]``, ``name[0,x2]``, …; no axis names the one entry ``name``.
+        knowledge: Least class that knows the block before any transmission.
+        node: Part that a local sensor observes: its row of the first axis (``"own"``), all
+            (``"broadcast"``) or none (``"hidden"``).
+        limit: Bound of the entries' absolute value.
+        constants: Numbers in ``meaning`` by symbol, mostly one per label of the last axes.
+
+    Raises:
+        ConfigurationError: ``knowledge`` or ``node`` is unknown.
+
+    Example:
+        >>> import numpy as np
+        >>> from fusion_gym.core.system import Block
+        >>> block = Block("mean", "x/2", lambda state: state / 2, labels=(("x1", "x2"),), limit=5.0)
+        >>> block.places, block.bounds
+        ((('x1',), ('x2',)), (-5.0, 5.0))
+        >>> block.fill(np.ones((2, 3))).shape
+        (2, 3)
     """
 
     name: str
@@ -165,7 +190,7 @@ class Block:
 
     @property
     def places(self) -> tuple[tuple[str, ...], ...]:
-        """The labels of each entry, in the order of a C-ordered array."""
+        """Labels of each entry, in the order of a C-ordered array."""
         return tuple(itertools.product(*self.labels))
 
     @property
@@ -174,7 +199,13 @@ class Block:
         return (0.0, 1.0) if self.limit is None else (-self.limit, self.limit)
 
     def fill(self, state: Any) -> NDArray[Any]:
-        """The entries (rows, N) of a state, not yet clipped.
+        """Return the entries of a state before clipping.
+
+        Args:
+            state: State of N runs after sensing.
+
+        Returns:
+            Entries (rows, N).
 
         Raises:
             ValueError: ``value`` returned another shape.
@@ -189,7 +220,7 @@ class Block:
 
 
 def age_block(sensors: tuple[str, ...]) -> Block:
-    """The entry that all systems have, of a state with ``age`` (sensors, N)."""
+    """Return the block of a state's ``age`` (sensors, N), which every system has."""
     meaning = "a/(a + 10), a steps since the last delivery"
     return Block(
         "age", meaning, lambda state: state.age / (state.age + 10.0), (sensors,), node="own"
@@ -197,21 +228,18 @@ def age_block(sensors: tuple[str, ...]) -> Block:
 
 
 def sensed(prediction: PredictionT | None) -> PredictionT:
-    """Return the prediction of a state, which it has after :meth:`System.sense`.
-
-    Raises:
-        RuntimeError: the state was never sensed.
-    """
+    """Return the prediction of a sensed state, or raise a ``RuntimeError`` for ``None``."""
     if prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
     return prediction
 
 
 def log_deviation(covariance: Array, reference: Array) -> Array:
-    """Return ln √(variance/reference) (..., n, N) of covariances (..., n, n, N).
+    """Return ln √(variance/reference) (..., n, N), minus infinity for a variance of zero.
 
-    ``reference`` (n,) are variances, zero of a state that is always known. Minus infinity for a
-    variance of zero.
+    Args:
+        covariance: (..., n, n, N).
+        reference: Variances (n,), zero for a state that is always known.
     """
     possible = np.where(reference > 0.0, reference, np.inf)
     with np.errstate(divide="ignore"):
@@ -219,12 +247,12 @@ def log_deviation(covariance: Array, reference: Array) -> Array:
 
 
 def numbered(count: int) -> tuple[str, ...]:
-    """The labels "0", "1", … of an axis."""
+    """Return the labels "0", "1", … of an axis."""
     return tuple(str(place) for place in range(count))
 
 
 class SignalError(KeyError):
-    """A signal that there is not, or that is withheld; a ``KeyError`` that shows plain text."""
+    """An unknown or withheld signal; a ``KeyError`` that shows plain text."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -233,12 +261,13 @@ class SignalError(KeyError):
 class Signals(Mapping[str, SignalArray]):
     """The signals of one step, in physical units, batch axis last.
 
-    A value may be given as a function; it is then computed when first looked at. ``hidden`` names
-    the signals that exist but that the environment's information mode withholds, ``missing`` those
-    that are not kept, and why.
+    Args:
+        values: Arrays by name, or functions that compute them on first access.
+        hidden: Names of signals that the information mode withholds.
+        missing: Names of signals that are not computed, and the reasons.
 
     Raises:
-        SignalError: (on access) an unknown or a withheld signal; the message says which.
+        SignalError: On access to an unknown or withheld signal.
     """
 
     def __init__(
@@ -255,7 +284,7 @@ class Signals(Mapping[str, SignalArray]):
         }
 
     def limit(self, refused: Mapping[str, str]) -> Self:
-        """Withhold these signals too, for the reasons given; returns the signals themselves."""
+        """Withhold the signals of ``refused``, names and reasons, and return the signals."""
         if refused:
             self._withheld |= refused
         return self
@@ -278,7 +307,7 @@ class Signals(Mapping[str, SignalArray]):
 
     @property
     def withheld(self) -> Mapping[str, str]:
-        """The names of the signals that are withheld or not kept, and why."""
+        """Names of the withheld or missing signals, and the reasons."""
         return self._withheld
 
     def __iter__(self) -> Iterator[str]:
@@ -288,7 +317,7 @@ class Signals(Mapping[str, SignalArray]):
         return sum(1 for _ in self)
 
 
-# What a system may have beside what every system has.
+# Methods and properties that a system may implement.
 CAPABILITIES = (
     *("adopt", "arrival_probability", "arriving", "covariance_cycle", "error_covariance"),
     *("fused_alone", "imagination_channels", "imagine", "with_actual_covariance"),
@@ -296,15 +325,30 @@ CAPABILITIES = (
 
 
 class System(ABC, Generic[StateT]):
-    """A networked estimation system, for N runs at once (batch axis last).
+    """Define a networked estimation system for N runs at once.
 
-    A state is a dataclass of arrays whose last axis is the batch; no method changes one in place.
-    ``state_names`` names the plant's n states, ``signals`` declares what :meth:`read` returns, and
-    ``nature`` says how the truth departs from the model. ``extensions`` lists the public methods
-    that a class has beyond those of its bases.
+    A state is a dataclass of arrays whose last axis is the batch; no method changes a state in
+    place. In the shapes below n is the number of states.
+
+    Attributes:
+        state_names: Names of the plant's n states.
+        signals: Declarations of the signals that :meth:`read` returns.
+        nature: Departure of the truth from the model.
+        extensions: Names of the public methods that a class adds to its bases.
 
     Raises:
-        TypeError: (on subclassing) a public method that is neither a base's nor in ``extensions``.
+        TypeError: A subclass has a public method that is neither in a base nor in ``extensions``.
+
+    Example:
+        >>> import numpy as np
+        >>> import fusion_gym
+        >>> system = fusion_gym.make_task("fusion_gym/TobitOscillator-v1").system
+        >>> state = system.start(np.zeros((system.start_channels, 4)))
+        >>> state = system.sense(state, np.zeros((system.noise_channels, 4)))
+        >>> delivered = system.deliver(state, np.ones((system.sensor_count, 4), dtype=bool))
+        >>> mean, covariance = system.fused(delivered)
+        >>> mean.shape, covariance.shape
+        ((2, 4), (2, 2, 4))
     """
 
     state_names: tuple[str, ...]
@@ -324,10 +368,13 @@ class System(ABC, Generic[StateT]):
                 )
 
     def offers(self, capability: str) -> bool:
-        """Return whether this system has an optional capability, one of ``CAPABILITIES``.
+        """Return whether this system implements an optional capability.
+
+        Args:
+            capability: A name of ``CAPABILITIES``.
 
         Raises:
-            ValueError: an unknown capability.
+            ValueError: The capability is unknown.
         """
         if capability not in CAPABILITIES:
             raise ValueError(f"capability = {capability!r} is not allowed: see CAPABILITIES")
@@ -341,133 +388,208 @@ class System(ABC, Generic[StateT]):
     @property
     @abstractmethod
     def noise_channels(self) -> int:
-        """Standard normals that :meth:`sense` consumes."""
+        """Number of standard normals that :meth:`sense` takes per run."""
 
     @property
     @abstractmethod
     def start_channels(self) -> int:
-        """Standard normals that :meth:`start` consumes, the last ones by ``nature``."""
+        """Number of standard normals that :meth:`start` takes per run, including ``nature``."""
 
     @property
     @abstractmethod
     def observation(self) -> tuple[Block, ...]:
-        """The blocks of an agent's observation, in their order."""
+        """Blocks of an agent's observation, in order."""
 
     @abstractmethod
     def start(self, noise: Array) -> StateT:
-        """Return time 0 from standard normals (start_channels, N)."""
+        """Return the state at time 0.
+
+        Args:
+            noise: Standard normals (start_channels, N).
+        """
 
     @abstractmethod
     def sense(self, state: StateT, noise: Array) -> StateT:
-        """Move the plant and measure, with standard normals (noise_channels, N)."""
+        """Return the state after a step of the plant and the new measurements.
+
+        Args:
+            state: State after :meth:`deliver` or :meth:`start`.
+            noise: Standard normals (noise_channels, N).
+        """
 
     @abstractmethod
     def deliver(self, state: StateT, granted: NDArray[np.bool_]) -> StateT:
-        """Update the nodes with what was granted (sensors, N), and fuse."""
+        """Return the state after the updates of the nodes and the fusion.
+
+        Args:
+            state: State after :meth:`sense`.
+            granted: (sensors, N) bool, the granted packets.
+        """
 
     @abstractmethod
     def read(self, state: StateT) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """Return the signals after :meth:`sense`."""
+        """Return the signals by name, as arrays or as functions that compute them.
+
+        Args:
+            state: State after :meth:`sense`.
+        """
 
     @abstractmethod
     def visible(self, state: StateT) -> StateT:
-        """Return the state without what no policy may know, for policies that plan.
+        """Return the state without hidden quantities, for policies that plan.
 
-        The truth and all that is not yet measured are not a number, coming losses are taken out:
-        :meth:`deliver` lets every grant arrive.
+        The truth and all future measurements are NaN. No packet is lost: :meth:`deliver` lets every
+        granted packet arrive.
+
+        Args:
+            state: State after :meth:`sense`.
         """
 
     @abstractmethod
     def local_means(self, state: StateT) -> Array:
-        """Return the nodes' means (sensors, n, N) after :meth:`deliver`, before any feedback."""
+        """Return the nodes' means (sensors, n, N) before any feedback.
+
+        Args:
+            state: State after :meth:`deliver`.
+        """
 
     @abstractmethod
     def open_loop(self, horizon: int) -> Array:
-        """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
+        """Return the mean error variance (n,) over t = 1..horizon without any delivery.
+
+        Args:
+            horizon: Steps of an episode.
+        """
 
     def rounding(self, horizon: int) -> tuple[float, float]:
-        """Return what float64 may lose at t = 0..horizon, in units of its precision; 0 if unknown.
+        """Return two ratios that bound the loss of float64's precision; 0 if unknown.
 
-        The largest mean square of a measurement over its noise's variance, and the largest ratio of
-        a predicted variance to what a packet after silence leaves of it.
+        Args:
+            horizon: Steps of an episode.
+
+        Returns:
+            The largest mean square of a measurement over its noise variance, and the largest ratio
+            of a predicted variance to the variance after a packet that ends a silence.
         """
         return 0.0, 0.0
 
     def truth(self, state: StateT) -> Array:
-        """Return the plant's state (n, N): for the reward and for metrics, never for a policy."""
+        """Return the plant's state (n, N), for the reward and metrics, never for a policy.
+
+        Args:
+            state: Any state.
+        """
         truth: Array = cast(Any, state).truth
         return truth
 
     def fused(self, state: StateT) -> tuple[Array, Array]:
-        """Return the centre's mean (n, N) and covariance (n, n, N) after :meth:`deliver`."""
+        """Return the fusion centre's mean (n, N) and covariance (n, n, N).
+
+        Args:
+            state: State after :meth:`deliver`.
+        """
         delivered = cast(Any, state)
         return delivered.mean, delivered.covariance
 
     def fused_mean(self, state: StateT) -> Array:
-        """Return the mean of :meth:`fused` (n, N); override it where the covariance is large."""
+        """Return the mean of :meth:`fused` (n, N); override it where the covariance is large.
+
+        Args:
+            state: State after :meth:`deliver`.
+        """
         return self.fused(state)[0]
 
     @property
     def censored_beyond(self) -> Mapping[int, tuple[float, float]]:
-        """Lowest and highest value that is seen of a state, by its number, for pictures."""
+        """Lowest and highest uncensored value of a state, by its number, for pictures."""
         return {}
 
     def arrival_probability(self, state: StateT) -> Array:
-        """Return the probability (sensors, N) that a packet sent after this sensing arrives.
+        """Return the probability (sensors, N) that a packet arrives if it is sent now.
 
-        From what is known before anything is sent. Offered where the channel may lose packets.
+        It depends only on the knowledge before any transmission. Systems with a lossy channel offer
+        it.
+
+        Args:
+            state: State after :meth:`sense`.
         """
         raise self._missing("arrival_probability")
 
     def arriving(self, state: StateT, packets: NDArray[np.bool_]) -> StateT:
-        """Return the state in which these packets (sensors, N), if sent now, are not lost."""
+        """Return the state in which the channel does not lose these packets.
+
+        Args:
+            state: State after :meth:`sense`.
+            packets: (sensors, N) bool.
+        """
         raise self._missing("arriving")
 
     def adopt(
         self, state: StateT, mean: Array, covariance: Array, runs: NDArray[np.bool_]
     ) -> StateT:
-        """Replace the centre's estimate (n, N), (n, n, N) of a delivered state in ``runs`` (N,)."""
+        """Return a state whose fusion centre has another estimate in some runs.
+
+        Args:
+            state: State after :meth:`deliver`.
+            mean: (n, N).
+            covariance: (n, n, N).
+            runs: (N,) bool, the runs whose estimate is replaced.
+        """
         raise self._missing("adopt")
 
     def fused_alone(self, state: StateT) -> tuple[Array, Array]:
-        """Return means (sensors, n, N) and covariances (sensors, n, n, N) after single deliveries.
+        """Return the fused estimates after a delivery of each single packet.
 
-        Entry i is :meth:`fused` after :meth:`deliver` of sensor i's packet alone. Offered where
-        all together cost less than one after another, and no packet is lost.
+        Systems without losses offer it where one common computation is faster than one per sensor.
+
+        Args:
+            state: State after :meth:`sense`.
+
+        Returns:
+            Means (sensors, n, N) and covariances (sensors, n, n, N). Entry i is :meth:`fused` after
+            :meth:`deliver` of sensor i's packet only.
         """
         raise self._missing("fused_alone")
 
     @property
     def imagination_channels(self) -> int:
-        """Standard normals that :meth:`imagine` consumes."""
+        """Number of standard normals that :meth:`imagine` takes per run."""
         raise self._missing("imagination_channels")
 
     def imagine(self, state: StateT, mean: Array, covariance: Array, noise: Array) -> StateT:
-        """Draw all that :meth:`visible` hides in a state after :meth:`sense`.
+        """Return a state with samples of all quantities that :meth:`visible` hides.
 
-        The truth follows N(mean, covariance) of shapes (n, N) and (n, n, N), the rest its law;
-        what has been measured stays. Two systems of one plant draw the same from the same
-        ``noise`` (imagination_channels, N).
+        The truth follows N(mean, covariance), and the other quantities follow their own laws.
+        Measurements remain. Two systems of one plant draw the same samples from the same ``noise``.
+
+        Args:
+            state: State after :meth:`sense`.
+            mean: (n, N).
+            covariance: (n, n, N).
+            noise: Standard normals (imagination_channels, N).
         """
         raise self._missing("imagine")
 
     @property
     def covariance_cycle(self) -> int:
-        """Steps after which the recursion of the covariances repeats itself.
+        """Period, in steps, of the covariance recursion.
 
-        Offered where the covariances follow from the deliveries alone, whatever is measured.
+        Systems whose covariances depend only on the deliveries offer it.
         """
         raise self._missing("covariance_cycle")
 
     def with_actual_covariance(self) -> System[StateT]:
-        """Return the same system with states that carry what :meth:`error_covariance` needs."""
+        """Return the same system with states that :meth:`error_covariance` can evaluate."""
         raise self._missing("with_actual_covariance")
 
     def error_covariance(self, state: StateT) -> Array:
-        """Return the actual covariance (n, n, N) of the fused error after :meth:`deliver`.
+        """Return the actual covariance (n, n, N) of the fused error.
 
-        After a start with zeros for noise it is the mean over all episodes. Deliveries must not
-        depend on the noise.
+        After a start with zero noise it is the mean over all episodes, provided that the deliveries
+        do not depend on the noise.
+
+        Args:
+            state: State after :meth:`deliver`, of :meth:`with_actual_covariance`.
         """
         raise self._missing("error_covariance")
 

@@ -1,4 +1,4 @@
-"""A task: a system, its network, what a policy may know, and what the answer is worth."""
+"""A task: a system, its network, the knowledge of a policy, and the reward."""
 
 from __future__ import annotations
 
@@ -20,39 +20,47 @@ from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
 
-# What a policy of each information mode may know.
+# Knowledge class of each information mode.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "scheduler", "centre": "centre"}
 ACTION_KINDS: tuple[str, ...] = get_args(Action)
-# Signals beside the system's own that only who sees the sensors may have.
+# Additional signals that need the sensors' measurements.
 SENSORS_ONLY = (
     "model", "beliefs", "belief_difference", "transmission_value", "own_beliefs",
     "own_difference", "own_value",
 )  # fmt: skip
-_MOST_DISCRETE = 16  # sensors whose requests are one number: that has 2^sensors values
+_MOST_DISCRETE = 16  # sensors with a discrete action of 2^sensors values
 
 
 @dataclass(frozen=True)
 class Task:
-    """Everything that an environment needs to know, independent of the number of runs.
+    """The definition of an environment, independent of the number of runs.
 
-    ``information`` is ``"sensors"`` (a scheduler that sees every sensor's new measurement) or
-    ``"centre"`` (only what the fusion centre knows before anything is sent). ``action`` is
-    ``"binary"`` (one bit a sensor) or ``"discrete"`` (the bits as one number, sensor 0 the lowest).
-    ``access`` is a rule of :mod:`fusion_gym.core.access`; with ``"single"`` the action is
-    0 for nobody or the number of the sensor, counted from 1.
-    ``packet``, ``broadcast``, ``memory``, ``memory_system`` and ``belief_features`` are those of
-    :mod:`fusion_gym.core.communication`; ``feedback`` says that the nodes get the centre's
-    estimate back. With ``clock`` the observation shows what is left of the episode, whose end then
-    belongs to the problem: a termination, no truncation. Without ``own_number`` a sensor that
-    decides by itself does not see which one it is, so that sensors of one kind learn together.
-    With ``vector_reward`` the environments pay the two terms of the reward one by one.
-    ``nominal_error`` (n,) are the mean squared errors by which entries of beliefs scale
-    (:mod:`fusion_gym.core.scale`); ``None`` are those without transmissions.
-    ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
-    parameters of named policies.
+    Args:
+        system: The system.
+        bucket: The token bucket.
+        reward: The reward.
+        horizon: Steps of an episode.
+        information: Content of the observation: ``"sensors"`` (all new measurements) or
+            ``"centre"`` (the fusion centre's knowledge before any transmission).
+        action: ``"binary"`` (one bit u_m per sensor) or ``"discrete"`` (the number Σ u_m 2^m).
+        access: Rule of :mod:`fusion_gym.core.access`. With ``"single"`` the action is 0 for no
+            request or m + 1 for sensor m.
+        packet: Content of a packet: ``"measurement"`` or ``"estimate"``.
+        broadcast: ``"none"``, ``"estimate"`` or ``"packets"`` (:mod:`fusion_gym.core.memory`).
+        memory: Whether the scheduler or each local sensor has memory.
+        memory_system: System whose filter is the memory.
+        belief_features: Observation entries of the beliefs, ``"difference"`` and ``"value"``.
+        feedback: Whether the nodes receive the centre's estimate.
+        clock: Whether the observation shows the steps left, so that an episode ends by termination.
+        own_number: Whether a local sensor observes its own number.
+        vector_reward: Whether the environments return the two terms of the reward.
+        nominal_error: Mean squared errors (n,) that scale belief entries
+            (:mod:`fusion_gym.core.scale`); ``None`` uses the errors without transmissions.
+        settings: The user's options, for reports.
+        policy_defaults: The scenario's parameters of named policies.
 
     Raises:
-        ConfigurationError: an unknown mode, a horizon below 1, or parts that do not fit together.
+        ConfigurationError: A mode is unknown, the horizon is below 1, or the parts do not fit.
     """
 
     system: System[Any]
@@ -101,13 +109,16 @@ class Task:
     def create(
         cls, scenario: Scenario, limit: int | None = None, nominal_error: Array | None = None
     ) -> Task:
-        """The scenario's system with its options' network, reward and episode.
+        """Return the task of a scenario.
 
-        ``limit`` shortens the episode without changing any scale. The options hold numbers, no
-        ``"auto"`` (:func:`fusion_gym.core.scale.resolve`).
+        Args:
+            scenario: Scenario whose options have numbers instead of ``"auto"``
+                (:func:`fusion_gym.core.scale.resolve`).
+            limit: Steps to truncation; the scales still follow the horizon.
+            nominal_error: Mean squared errors (n,) that scale belief entries.
 
         Raises:
-            ConfigurationError: a value that is not allowed.
+            ConfigurationError: A value is not allowed.
         """
         options, system = scenario.options, scenario.system
         if not isinstance(system, System):
@@ -155,7 +166,7 @@ class Task:
 
     @property
     def knowledge(self) -> Knowledge:
-        """What a policy may know, in the one vocabulary."""
+        """Knowledge class of a policy."""
         known = INFORMATION_MODES[self.information]
         return least_covering((known, "scheduler_memory")) if self.memory else known
 
@@ -166,7 +177,7 @@ class Task:
 
     @functools.cached_property
     def open_loop(self) -> Array:
-        """Mean error variances (n, 1) of a centre that never receives."""
+        """Mean error variances (n, 1) without any delivery."""
         return self.system.open_loop(self.horizon)[:, None]
 
     @functools.cached_property
@@ -176,7 +187,7 @@ class Task:
 
     @functools.cached_property
     def error_scale(self) -> float:
-        """What a squared error counts in the reward, in the mean over the states."""
+        """Weight of a squared error in the reward, averaged over the states."""
         return float(self.reward.error_weight * self.reward.state_weights.mean())
 
     @functools.cached_property
@@ -195,14 +206,7 @@ class Task:
 
 
 def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
-    """The token bucket of the options.
-
-    Warns:
-        UserWarning: it favours some sensors, or never pays for a packet of each.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the token bucket of the options, with a warning if it favours some sensors."""
     bucket = TokenBucket.create(
         rate=options.token_rate,
         capacity=options.token_capacity,

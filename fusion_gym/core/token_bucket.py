@@ -1,4 +1,4 @@
-"""Token bucket: the network's hard limit on transmissions."""
+"""Token bucket: the network's hard limit of the rate of transmissions."""
 
 from __future__ import annotations
 
@@ -18,14 +18,18 @@ from fusion_gym.validation import ConfigurationError
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
 Queue = NDArray[np.int64]
 _ROUNDING = 1e-9  # tokens: ten times 0.1 pays for a transmission that costs 1
-_FEW = 16  # sensors up to which comparing all pairs is faster than sorting
+_FEW = 16  # sensors up to which pairwise comparison is faster than sorting
 
 
 class Grants(NamedTuple):
-    """What the network answered.
+    """The network's response to the requests of a step.
 
-    ``granted`` (sensors, N) bool, ``spent`` and ``tokens`` (N,), and ``queue`` (sensors, N), each
-    sensor's place in the queue, 0 for who was granted least recently.
+    Attributes:
+        granted: (sensors, N) bool.
+        spent: Tokens spent (N,).
+        tokens: Tokens after the step (N,).
+        queue: Place of each sensor in the queue (sensors, N), 0 for the sensor granted least
+            recently.
     """
 
     granted: NDArray[np.bool_]
@@ -36,23 +40,23 @@ class Grants(NamedTuple):
 
 @dataclass(frozen=True)
 class TokenBucket:
-    """Tokens are generated at ``rate`` a step up to ``capacity``; a grant to sensor m costs c_m.
+    """Tokens accrue at ``rate`` per step up to ``capacity``; a grant to sensor m costs c_m.
 
-    ``sharing`` says how simultaneous requests share the bucket:
+    Under every rule a granted sensor goes to the end of the queue, several in their order.
 
-    - ``"equal"``: each of the l sensors owns an l-th of the tokens, and a request is granted if
-      ξ/l >= c_m (tobit_token_bucket, equations (16) and (18)). With equal costs that is all or
-      nothing. It looks at the tokens before this step's spending.
-    - ``"fixed"``: requests are granted in the order of the sensors while tokens last.
-    - ``"rotating"``: the same, the first in the order moving on by one sensor each step.
-    - ``"turns"``: the same in the order of a queue, whose head blocks those behind it if the tokens
-      do not pay for it. Of two sensors that request alike neither gets more than one grant more
-      than the other, in any window.
-
-    The queue moves under every rule: who is granted goes to its end, several in their order.
-    ``unlimited`` grants everything; tokens spent are still counted, the level stays full.
-
-    Shapes: ``cost`` (sensors, 1), in tokens; ``rate``, ``capacity`` and ``initial`` in tokens.
+    Args:
+        rate: Tokens per step.
+        capacity: Largest number of tokens.
+        initial: Tokens at the start of an episode.
+        cost: Tokens c (sensors, 1).
+        sharing: ``"equal"``: each of the l sensors owns ξ/l of the tokens ξ before this step's
+            spending, and a request is granted if ξ/l >= c_m (tobit_token_bucket, equations (16) and
+            (18)). ``"fixed"``: requests are granted in the order of the sensors while tokens last.
+            ``"rotating"``: the same order starts one sensor later in each step. ``"turns"``: the
+            order is a queue, whose head blocks the others if the tokens do not pay for it; of two
+            sensors with equal requests, neither gets more than one grant more than the other in any
+            window.
+        unlimited: Whether every request is granted; tokens spent are counted, the level stays full.
     """
 
     rate: float
@@ -73,13 +77,7 @@ class TokenBucket:
         sharing: str = "equal",
         unlimited: bool = False,
     ) -> TokenBucket:
-        """Check the numbers; ``cost`` is one number or one for each sensor.
-
-        Raises:
-            ConfigurationError: a negative rate, a cost <= 0, an initial level outside
-                [0, capacity], an unknown sharing rule, or a capacity with which some sensor
-                could never transmit.
-        """
+        """Return a bucket with checked numbers; ``cost`` is one number or one per sensor."""
         costs = validation.positive("token_cost", cost, (sensors,))[:, None]
         limit = validation.number("token_capacity", capacity, above=0.0)
         rule = validation.choice("sharing", sharing, SHARING_RULES)
@@ -114,7 +112,7 @@ class TokenBucket:
     def resonates(self) -> bool:
         """Whether round-robin access grants some sensors more often than others if all request.
 
-        A packet is paid for every p/q steps, in lowest terms. With d = gcd(p, sensors) the grants
+        A packet costs the tokens of p/q steps, in lowest terms. With d = gcd(p, sensors) the grants
         fall on q of d groups of sensors in turn, evenly where d divides q.
         """
         costs = np.unique(self.cost)
@@ -125,23 +123,20 @@ class TokenBucket:
 
     @property
     def favours_cheaper(self) -> bool:
-        """Whether a turn that goes by the step may be lost by dearer sensors more often.
-
-        At a rate of the largest cost and above, every turn is paid for in the end.
-        """
+        """Whether sensors with a higher cost may lose their turns more often (rate < max c_m)."""
         unequal = float(self.cost.min()) < float(self.cost.max())
         return not self.unlimited and unequal and self.rate < float(self.cost.max())
 
     def start(self, num_envs: int) -> Array:
-        """Tokens at the start of an episode, shape (num_envs,)."""
+        """Return the tokens (num_envs,) at the start of an episode."""
         return np.full(num_envs, self.capacity if self.unlimited else self.initial)
 
     def start_queue(self, num_envs: int) -> Queue:
-        """The queue at the start of an episode, sensor 0 first, shape (sensors, num_envs)."""
+        """Return the queue (sensors, num_envs) at the start of an episode, sensor 0 first."""
         return np.repeat(np.arange(len(self.cost))[:, None], num_envs, axis=1)
 
     def affordable(self, tokens: Array) -> NDArray[np.bool_]:
-        """Return whether tokens (N,) pay for a request of each sensor alone, (sensors, N)."""
+        """Return whether tokens (N,) pay for a single request of each sensor (sensors, N)."""
         share = len(self.cost) if self.sharing == "equal" else 1
         return np.asarray((self.cost * share <= tokens + _ROUNDING) | self.unlimited)
 
@@ -152,10 +147,13 @@ class TokenBucket:
         step: NDArray[np.int64],
         queue: Queue | None = None,
     ) -> Grants:
-        """Answer the requests (sensors, N) with the tokens (N,).
+        """Return the grants for the requests of a step.
 
-        ``step`` (N,) turns the order of ``"rotating"``, ``queue`` (sensors, N) is the order of
-        ``"turns"``; by default sensor 0 is first. Grants move the queue under every rule.
+        Args:
+            tokens: (N,).
+            requests: (sensors, N) bool.
+            step: Steps taken (N,), the start of the order of ``"rotating"``.
+            queue: (sensors, N), the order of ``"turns"``; by default sensor 0 is first.
 
         Source: tobit_token_bucket, equations (16)-(18).
         """
@@ -168,7 +166,7 @@ class TokenBucket:
             granted = self._grant_by_queue(tokens, requests, queue)
         else:
             granted = self._grant_in_order(tokens, requests, step)
-        paid = granted * self.cost  # np.sum adds 8 terms and more in another order if N is 1
+        paid = granted * self.cost  # np.sum reorders 8 or more terms if N is 1
         spent = paid.sum(0) if len(paid) < 8 else np.cumsum(paid, axis=0)[-1]
         if not self.unlimited:
             tokens = np.minimum(np.maximum(tokens + self.rate - spent, 0.0), self.capacity)
@@ -177,7 +175,7 @@ class TokenBucket:
     def _grant_by_queue(
         self, tokens: Array, requests: NDArray[np.bool_], queue: Queue
     ) -> NDArray[np.bool_]:
-        """Grant what the tokens pay for together with all requests ahead of it in the queue."""
+        """Grant each request if the tokens pay for it and all requests ahead in the queue."""
         place, total = queue * len(tokens) + np.arange(len(tokens)), np.empty(requests.shape)
         total.reshape(-1)[place] = requests * self.cost
         return requests & (np.cumsum(total, axis=0) <= tokens + _ROUNDING).take(place)
@@ -185,7 +183,7 @@ class TokenBucket:
     def _grant_in_order(
         self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
-        """Grant in the order of the sensors, from the first of this step on, what is paid for."""
+        """Grant affordable requests in the order of the sensors, from the first of this step."""
         runs, granted, left = np.arange(len(tokens)), np.zeros_like(requests), tokens + _ROUNDING
         first = step if self.sharing == "rotating" else np.zeros_like(step)
         for place in range(len(requests)):
@@ -197,7 +195,7 @@ class TokenBucket:
 
 
 def move_to_end(queue: Queue, granted: NDArray[np.bool_]) -> Queue:
-    """Return the queue after these grants: who was granted is last, several in their order."""
+    """Return the queue with granted sensors at its end, several in their order."""
     if len(queue) == 1:
         return queue
     key = queue + len(queue) * granted

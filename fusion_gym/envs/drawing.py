@@ -1,4 +1,4 @@
-"""The live episode as a picture: states and estimates, requests and their answers, tokens."""
+"""Pictures of a running episode: states and estimates, requests and grants, tokens."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -15,16 +15,16 @@ from fusion_gym.core.task import Task
 from fusion_gym.importing import require
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
-WINDOW = 60  # steps that are shown
+WINDOW = 60  # steps in a picture
 _MOST_STATES = 4
-# Okabe and Ito's colours, which people who are colour-blind tell apart.
+# Okabe and Ito's palette for colour-blind readers.
 _TRUTH, _ESTIMATE, _GRANTED, _DENIED, _TOKENS = "black", "#D55E00", "#0072B2", "0.55", "#009E73"
 _CENSORED = "#CC79A7"
 _WIDTH, _STATE, _STRIP, _TOP, _BOTTOM = 640, 120, 70, 62, 44  # pixels
 
 
 class _Step(NamedTuple):
-    """What is kept of one step of all runs: no copies, for nothing of it changes in place."""
+    """The drawn arrays of one step of all runs, shared without copies."""
 
     state: Any
     outcome: Outcome
@@ -32,11 +32,15 @@ class _Step(NamedTuple):
 
 
 class Film:
-    """The last steps of N runs of a task, and a picture of each.
+    """The last steps of N runs of a task, and a picture of each run.
 
-    Above, up to four states with the fused estimate and two deviations that the filter claims,
-    and shaded where a sensor of that state alone is censored; then a row a sensor of requests,
-    granted or denied; then the tokens.
+    A picture shows up to four states with the fused estimate and two claimed standard deviations,
+    one row of requests per sensor (granted or denied), and the tokens. The censored range of a
+    state is shaded.
+
+    Args:
+        task: The task.
+        runs: Number N of runs.
 
     Raises:
         ConfigurationError: matplotlib is absent.
@@ -48,19 +52,19 @@ class Film:
         self._steps: deque[_Step] = deque(maxlen=WINDOW)
         self._ages = np.zeros(runs, dtype=np.int64)  # steps of each run's episode
         self._state_names = task.system.state_names[:_MOST_STATES]
-        self._figure: Any = None  # made when it is first looked at
+        self._figure: Any = None  # created by the first frame
 
     def begin(self, runs: NDArray[np.int64] | None = None) -> None:
-        """These runs (all by default) begin a new episode."""
+        """Begin a new episode in ``runs``, by default in all."""
         self._ages[slice(None) if runs is None else runs] = 0
 
     def record(self, batch: EpisodeBatch, outcome: Outcome) -> None:
-        """A step of all runs, before any of them is reset."""
+        """Record a step of all runs, before a reset."""
         self._steps.append(_Step(batch.delivered, outcome, batch.tokens))
         self._ages += 1
 
     def limits(self, run: int = 0) -> list[tuple[float, float]]:
-        """How far the axis of each state that is shown has to reach, for films side by side."""
+        """Return the axis limits of each drawn state, for films side by side."""
         truth, mean, deviation = self._shown_of(self._steps_of(run), run)
         if not len(truth):
             return [(-1.0, 1.0)] * len(self._state_names)
@@ -74,10 +78,7 @@ class Film:
         title: str | None = None,
         limits: Sequence[tuple[float, float]] | None = None,
     ) -> Frame:
-        """The picture of a run, of which no more is shown than its own episode.
-
-        ``title`` instead of the step, ``limits`` instead of those of this run.
-        """
+        """Return the picture of a run's present episode, by default with the step as title."""
         if self._figure is None:
             self._draw_frame()
         age, steps = int(self._ages[run]), self._steps_of(run)
@@ -99,12 +100,12 @@ class Film:
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _steps_of(self, run: int) -> list[_Step]:
-        """The steps of this run's episode that the window shows."""
+        """Return the recorded steps of this run's episode in the window."""
         age = int(self._ages[run])
         return list(self._steps)[-min(age, WINDOW) :] if age else []
 
     def _shown_of(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
-        """Truth, fused estimate and two deviations that it claims, each (steps, shown)."""
+        """Return truth, fused estimate and two claimed deviations, each (steps, shown)."""
         system, visible = self.task.system, len(self._state_names)
         fused = [system.fused(step.state) for step in steps]
         truth = np.array([system.truth(step.state)[:visible, run] for step in steps])
@@ -132,7 +133,7 @@ class Film:
             axis.set_ylim(*ends)
 
     def _draw_frame(self) -> None:
-        """All that does not move."""
+        """Draw the static parts of the picture."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -178,7 +179,7 @@ class Film:
         level.set_xlabel("step")
         for axis in self._axes:
             axis.tick_params(labelsize=8)
-            axis.yaxis.set_label_coords(-0.065, 0.5)  # a fixed place: quicker, and all in line
+            axis.yaxis.set_label_coords(-0.065, 0.5)  # a fixed position is faster
             axis.grid(alpha=0.25)
             axis.spines[["top", "right"]].set_visible(False)
         handles: dict[str, Any] = {}
@@ -196,11 +197,7 @@ class Film:
 
 
 class Window:
-    """A window that shows frames as they come, ``fps`` a second.
-
-    Raises:
-        ConfigurationError: pygame is absent.
-    """
+    """A window that shows ``fps`` frames per second; it needs pygame."""
 
     def __init__(self, title: str, fps: int) -> None:
         require("render_mode", "render", "pygame")
@@ -208,7 +205,7 @@ class Window:
         self._screen: Any = None
 
     def show(self, frame: Frame) -> None:
-        """One frame, for its time."""
+        """Show one frame for 1/fps seconds."""
         import pygame
 
         if self._screen is None:
@@ -222,7 +219,7 @@ class Window:
         self._clock.tick(self._fps)
 
     def close(self) -> None:
-        """The window is gone."""
+        """Close the window."""
         if self._screen is not None:
             import pygame
 

@@ -1,4 +1,4 @@
-"""What Gymnasium's own vector environments tell of the single environments that they hold."""
+"""The attributes and methods of single runs, as in Gymnasium's own vector environments."""
 
 from typing import Any
 
@@ -9,16 +9,13 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.validation import display
 
-# Attributes that all runs share, as single environments have them.
+# Attributes of a single environment that all runs share.
 _SHARED = ("task", "view", "observation_names", "reward_space", "spec", "metadata", "render_mode")
 _METHODS = ("action_masks", "render")
 
 
 class Members:
-    """The runs of a vector environment, asked as if each were an environment of its own.
-
-    ``call``, ``get_attr`` and ``set_attr`` are those of ``gymnasium.vector.SyncVectorEnv``.
-    """
+    """The runs of a vector environment with the interface of ``gymnasium.vector.SyncVectorEnv``."""
 
     num_envs: int
     batch: EpisodeBatch
@@ -27,37 +24,22 @@ class Members:
     single_action_space: Any
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Open choices (N, choices), as in sb3-contrib's MaskablePPO.
-
-        Closed are requests that the network would not grant even alone.
-        """
+        """Return the choices (N, choices), bool, that the network can grant as a single request."""
         return self.view.masks(self.batch.grantable())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """What a method of each run returns, or its attribute: ``action_masks``, ``render``, …
-
-        Raises:
-            AttributeError: runs have no such method or attribute, for they share one batch.
-        """
+        """Return the result of ``action_masks`` or ``render``, or an attribute, once per run."""
         if name in _METHODS:
             result = getattr(self, name)(*args, **kwargs)
             return (None,) * self.num_envs if result is None else tuple(result)
         return (self._attribute(name),) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every run: spaces are those of one run, all else is what they share.
-
-        Raises:
-            AttributeError: runs have no such attribute.
-        """
+        """Return an attribute once per run, the spaces without the batch axis."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Refused: the runs share one task, make another environment instead.
-
-        Raises:
-            AttributeError: always.
-        """
+        """Raise an ``AttributeError``, because all runs share one task."""
         raise AttributeError(
             f"cannot set {name!r} of some runs: they share one task; make a new environment"
         )

@@ -1,7 +1,6 @@
-"""Stable-Baselines3's vector of single environments, exchanged for one batch.
+"""Replace Stable-Baselines3's vector of single environments by one batch.
 
-Tools that make their environments one by one, as rl-zoo3 does, train at the speed of the batch: its
-files of hyper-parameters name :func:`one_batch` as ``vec_env_wrapper``.
+rl-zoo3's hyper-parameter files name :func:`one_batch` as ``vec_env_wrapper``.
 """
 
 from typing import Any
@@ -18,22 +17,23 @@ from fusion_gym.validation import ConfigurationError, display, refusal
 
 
 def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
-    """A batch with as many runs, the same environment and the same seeds; ``envs`` are closed.
+    """Return a batch of the same environment with as many runs and the same seeds; close ``envs``.
 
-    ``options`` belong to :func:`~fusion_gym.envs.privileged.make_sb3_vec_env`; what the
-    environments were made with comes before them. Without options the batch's episodes are bitwise
-    the episodes of ``envs``. Monitors write no files any more, their infos are the batch's own.
+    Args:
+        envs: Vector of environments of one registered id, made alike by ``gym.make`` and without
+            wrappers other than ``Monitor``.
+        **options: Options of :func:`~fusion_gym.envs.privileged.make_sb3_vec_env`, which the
+            environments' own options replace. Without options the episodes are bitwise equal.
 
     Raises:
-        ConfigurationError: environments of another kind or made differently, with a window, or in
-            wrappers, which would be lost; an option that is unknown or has a value that is not
-            allowed.
+        ConfigurationError: The environments differ, have a window or have wrappers, or an option is
+            not allowed.
     """
     specs = envs.get_attr("spec")
     spec = specs[0]
     if spec is None:
         raise ConfigurationError("environments in one batch must be made by gym.make")
-    base, _ = base_of(spec.id)  # the options are in the specification too
+    base, _ = base_of(spec.id)  # the specification has the options too
     if any(_made_with(other) != _made_with(spec) for other in specs):
         raise ConfigurationError(
             f"different environments {display([_made_with(other) for other in specs])} are not "
@@ -57,5 +57,5 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
 
 
 def _made_with(spec: EnvSpec) -> Any:
-    """What two specifications have in common if their environments are alike."""
+    """Return the id, step limit and options that equal environments share."""
     return spec.id, spec.max_episode_steps, plain_options(spec.kwargs)

@@ -9,11 +9,7 @@ from fusion_gym.validation import ConfigurationError, read_text
 
 
 def read_options(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The options that a YAML file holds, by name.
-
-    Raises:
-        ConfigurationError: the file cannot be read, is no YAML or no mapping, or PyYAML is absent.
-    """
+    """Return the options of a YAML file by name."""
     if not isinstance(path, (str, os.PathLike)):
         raise refusal("system", path, "the path of a YAML file")
     source = f"system = {os.fspath(path)!r}"

@@ -11,7 +11,7 @@ from fusion_gym.declaration import choices, hints, meanings, type_text
 
 
 class Option(NamedTuple):
-    """An option as its field declares it; ``choices`` are all its values where they are few."""
+    """An option with its type, default, meaning and, where they are few, its values."""
 
     type: str
     default: Any
@@ -19,7 +19,7 @@ class Option(NamedTuple):
     choices: tuple[str, ...] = ()
 
 
-# What every environment takes beside the fields of its options.
+# Options of every environment in addition to its dataclass.
 FOR_ALL = {
     "system": Option("str | None", None, "Path of a YAML file of options."),
     "max_episode_steps": Option("int | None", None, "Steps to truncation; all scales stay."),
@@ -27,7 +27,7 @@ FOR_ALL = {
 
 
 def options_in(kind: type[CommonOptions]) -> dict[str, Option]:
-    """Return every option by its name: the environment's own, then those that all have."""
+    """Return every option by name: first the environment's own, then the common ones."""
     value, common = kind(), {field.name for field in fields(CommonOptions)}
     types, texts = hints(kind), meanings(kind)
     result = {}
@@ -41,7 +41,7 @@ def options_in(kind: type[CommonOptions]) -> dict[str, Option]:
 def list_options(
     options: Mapping[str, Option], value: Mapping[str, Any] | None = None
 ) -> Iterator[str]:
-    """Yield the lines of each option; of one that is ``value`` its value, then its default."""
+    """Yield the lines of each option, with its entry of ``value`` if there is one."""
     for name, option in options.items():
         default = short(option.default)
         if value is not None and name in value:
@@ -52,7 +52,7 @@ def list_options(
 
 
 def short(value: Any) -> str:
-    """Return a value as it would be written, its numbers with four digits."""
+    """Return a value as text, floats with four significant digits."""
     value = plain_options(value)
     if isinstance(value, list):
         return f"({', '.join(map(short, value))}{',' if len(value) == 1 else ''})"

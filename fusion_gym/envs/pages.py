@@ -1,8 +1,8 @@
-"""An environment's page, made from what the code declares: options, blocks, spaces.
+"""An environment's page, written from the declarations of options, blocks and spaces.
 
-The documentation shows a table by the directive ``KIND-table`` with a text, KIND a name of
-``TABLES``. The text of ``observation`` is ``ID name=value``; after a semicolon follow other
-options, and the table marks their entries. That of ``options`` has ids and names of options.
+The documentation's directive ``KIND-table``, KIND a name of ``TABLES``, writes a table from its
+text. ``observation`` takes ``ID name=value``; after a semicolon follow other options, whose
+additional entries the table marks. ``options`` takes ids and names of options.
 """
 
 import ast
@@ -36,15 +36,15 @@ A star marks what only the sensors know: `information="centre"` leaves it out. T
 tells what a sensor that decides by itself sees of these entries; with `broadcast="estimate"` it
 sees all without a star that belong to no sensor, with `broadcast="packets"` all without a star."""
 
-_PAGE = Path(__file__).with_name("page.md")  # with the names of what page() fills in
-# Blocks of the network that not every task has, and when they are there.
+_PAGE = Path(__file__).with_name("page.md")  # a template for page()
+# Network blocks of some tasks, and their conditions.
 _NETWORK = {
     "admitted": 'only with `access="round_robin"` or `"random"`',
     "queue": 'only with `sharing="turns"` and limited tokens',
     "time_left": "only with `clock=True`",
     "price": "only with a `price_range`",
 }
-# What is believed, in the observation of the scheduler and in a sensor's own.
+# Conditions of the belief blocks of the scheduler and of a local sensor.
 _BELIEFS: dict[Owner, str] = {
     "scheduler": "only with `memory=True` or `belief_features`",
     "own": "only with `memory=True` or `belief_features`, for a sensor by itself",
@@ -57,7 +57,7 @@ _ACTIONS = {
     "discrete": "The number has a bit for each sensor, the lowest for sensor 0",
 }
 _LONGEST = 60  # characters of a default in a table
-# What writes the table of a kind from the text of its directive: "module:function".
+# The function "module:name" that writes the table of each directive.
 TABLES = {
     "observation": f"{__name__}:observation_text",
     "options": f"{__name__}:option_table",
@@ -73,13 +73,14 @@ _SECOND = f"v1: covariances may be singular{_QUEUE}; noise is counted, not drawn
 
 
 def page(env_id: str, task: Task | None = None) -> str:
-    """The page of a registered environment: of a task of it, or with its defaults.
+    """Return the page of a registered environment.
 
-    Title and description are the docstring of its options' dataclass; paragraphs that begin
-    ``v1:``, ``v2:``, … there are the version history.
+    The docstring of its options' dataclass gives title and description; paragraphs that begin with
+    ``v1:``, ``v2:``, … are the version history.
 
-    Raises:
-        ConfigurationError: an id that is not registered.
+    Args:
+        env_id: Id of the environment.
+        task: A task of the environment; ``None`` takes the default options.
     """
     kind = options_of(env_id)
     task = make_task(env_id) if task is None else task
@@ -108,10 +109,11 @@ def page(env_id: str, task: Task | None = None) -> str:
 
 
 def observation_table(task: Task, *others: tuple[str, Task]) -> str:
-    """The observation's blocks as a Markdown table, those of all information modes.
+    """Return the observation blocks of all information modes as a Markdown table.
 
-    ``others`` are named tasks of the same environment whose blocks may be different; what the
-    first does not have is marked with the name. So is what only some networks show.
+    Args:
+        task: The task.
+        *others: Names and tasks of the same environment; their additional blocks carry the name.
     """
     rows = {block.name: _row(task, block) for block in task.system.observation}
     for name, other in others:
@@ -132,12 +134,10 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
 
 
 def option_table(text: str) -> str:
-    """Return the options of environments that have the same ones as a Markdown table.
+    """Return options of one or more environments as a Markdown table.
 
-    ``text`` has ids, and the names of the options in the table; without a name all are.
-
-    Raises:
-        ConfigurationError: an id that is not registered.
+    Args:
+        text: Ids of environments with the same options, and names of options; without a name all.
     """
     words = text.split()
     every = [options_in(options_of(word)) for word in words if "/" in word]
@@ -152,10 +152,10 @@ def option_table(text: str) -> str:
 
 
 def observation_text(marker: str) -> str:
-    """Return legend, table and size of the observation that a marker names.
+    """Return legend, table and size of an observation.
 
-    Raises:
-        ConfigurationError: an id or an option that does not exist.
+    Args:
+        marker: ``ID name=value …``, and other options after a semicolon.
     """
     first, *others = marker.split(";")
     env_id, *options = shlex.split(first)
@@ -168,11 +168,7 @@ def observation_text(marker: str) -> str:
 
 
 def task_of(text: str) -> Task:
-    """Return the task that ``ID name=value …`` names.
-
-    Raises:
-        ConfigurationError: an id or an option that does not exist.
-    """
+    """Return the task of the text ``ID name=value …``."""
     env_id, *options = shlex.split(text)
     return make_task(env_id, **_options(options))
 
@@ -193,7 +189,7 @@ def fusion_table(env_id: str) -> str:
 
 def _paragraphs(kind: type[CommonOptions]) -> list[str]:
     text = inspect.cleandoc(kind.__doc__ or "")
-    # A dataclass without a docstring gets its signature for one.
+    # The default docstring of a dataclass is its signature.
     return [] if text.startswith(f"{kind.__name__}(") else plain_marks(text).split("\n\n")
 
 
@@ -207,7 +203,7 @@ def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
 
 
 def _seen(task: Task, block: Block) -> str:
-    """What a sensor that decides by itself sees of a block."""
+    """Return the part of a block that a local sensor observes."""
     entries = block_entries(block)
     return (
         "all" if all(is_received(entry, task.broadcast) for entry in entries) else _SEES[block.node]
@@ -215,7 +211,7 @@ def _seen(task: Task, block: Block) -> str:
 
 
 def _axis(task: Task, block: Block, place: int) -> str:
-    """What an axis runs over: sensors, states, components, or its own labels."""
+    """Return the name of an axis: sensor, state, component, or its own labels."""
     labels = block.labels[place]
     if place == 0 and (block.node == "own" or labels == numbered(task.sensors)):
         return "sensor"
@@ -225,7 +221,7 @@ def _axis(task: Task, block: Block, place: int) -> str:
 
 
 def _options(words: list[str]) -> dict[str, Any]:
-    """Options from ``name=value``, the value a literal of Python or a string."""
+    """Return options from ``name=value``, where the value is a Python literal or a string."""
     result: dict[str, Any] = {}
     for name, _, value in (word.partition("=") for word in words):
         try:
@@ -241,5 +237,5 @@ def _listed(words: list[str]) -> str:
 
 
 def _double(text: str) -> str:
-    """Words in the quotes of the documentation."""
+    """Return the text with double quotes."""
     return text.replace("'", '"')

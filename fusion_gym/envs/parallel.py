@@ -1,4 +1,4 @@
-"""The multi-agent view: every sensor an agent of PettingZoo's parallel interface."""
+"""The multi-agent view: every sensor is an agent of PettingZoo's parallel interface."""
 
 from __future__ import annotations
 
@@ -22,15 +22,29 @@ Dict = dict[str, Any]
 
 
 class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
-    """One run, in which each sensor decides by itself whether to request (1) or not (0).
+    """Run one episode of a task with every sensor as an agent, which requests (1) or not (0).
 
-    An agent observes what its sensor sees by itself (:class:`~fusion_gym.envs.views.SensorView`),
-    all get the run's reward. Episodes end by truncation for all agents at once.
+    An agent observes the entries of its :class:`~fusion_gym.envs.views.SensorView`. All agents
+    receive the reward of the run, and their episodes end together.
+
+    Args:
+        task: The task, as :func:`fusion_gym.make_task` returns it.
 
     Attributes:
-        observation_names: a name for each entry of an agent's observation.
-        state_names: a name for each entry of :meth:`state`.
-        state_space: the Box of :meth:`state`, float32.
+        observation_names: Name of each entry of an agent's observation.
+        state_names: Name of each entry of :meth:`state`.
+        state_space: The Box of :meth:`state`, float32.
+
+    Raises:
+        ConfigurationError: The task has a vector reward or no view for local sensors.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
+        >>> env = fusion_gym.FusionParallelEnv(task)
+        >>> observations, infos = env.reset(seed=0)
+        >>> env.agents, observations["sensor_0"].shape, env.state().shape
+        (['sensor_0', 'sensor_1', 'sensor_2'], (17,), (32,))
     """
 
     metadata = {"render_modes": [], "name": "fusion_gym_v0", "is_parallelizable": True}  # noqa: RUF012
@@ -51,18 +65,22 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self.action_spaces = dict.fromkeys(self.possible_agents, self.view.actions)
 
     def observation_space(self, agent: str) -> Box:
-        """Box of shape (entries,), float32, the same for every agent."""
+        """Return the Box (entries,), float32, which is the same for every agent."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Discrete[Any]:
-        """``Discrete(2)``: 1 requests a transmission."""
+        """Return ``Discrete(2)``, in which 1 is a request."""
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: Dict | None = None) -> tuple[Dict, Dict]:
-        """A new episode; without a seed the noise goes on where it stood.
+        """Begin a new episode.
 
-        The infos are those of a step in which nothing was sent.
-        There are no options, and PettingZoo's interface test demands that any be taken.
+        Args:
+            seed: Seed of the episodes; ``None`` begins the next episode of the present seed.
+            options: Ignored; PettingZoo's interface test requires a reset to accept options.
+
+        Returns:
+            The observations and infos of all agents, as dictionaries.
         """
         self.batch.seed(np.zeros(1, dtype=np.int64), [seed])
         self.batch.reset()
@@ -71,11 +89,18 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         return self._observations(), infos
 
     def step(self, actions: Dict) -> tuple[Dict, Dict, Dict, Dict, Dict]:
-        """One step with an action of every agent; an info has ``granted`` and ``cost``.
+        """Make one step.
+
+        Args:
+            actions: The action 0 or 1 of every agent.
+
+        Returns:
+            Dictionaries by agent: observations, rewards, ``terminated``, ``truncated`` and infos.
+            An info has ``granted`` and ``cost`` (tokens).
 
         Raises:
-            ResetNeeded: before the first reset, or after the end of the episode.
-            ValueError: an agent without an action, or an action other than 0 and 1.
+            ResetNeeded: The episode has not begun or is over.
+            ValueError: An agent has no action, or an action is not 0 or 1.
         """
         if not self.agents:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
@@ -105,14 +130,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         return result
 
     def state(self) -> NDArray[np.float32]:
-        """What all sensors and the centre know together (entries,), for a central critic.
-
-        It is a scheduler's observation, with what each sensor remembers by itself in a task with
-        memory: everything that an agent observes but its own number, and nothing of the truth.
-
-        Raises:
-            ResetNeeded: before the first reset.
-        """
+        """Return the scheduler's observation (entries,) with all memories, for a central critic."""
         if self.batch.state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first state")
         return self.batch.observe()[0]
@@ -122,13 +140,22 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         return dict(zip(self.agents, rows, strict=True))
 
     def render(self) -> None:
-        """Nothing to see; figures are made by ``fusion_gym.evaluation.episodes.record_episode``."""
+        """Do nothing; :func:`fusion_gym.evaluation.record_episode` records data for figures."""
 
 
 def parallel_env(env_id: str, **options: Any) -> FusionParallelEnv:
-    """The multi-agent view of a registered environment; ``options`` are those of ``gym.make``.
+    """Return the multi-agent environment of a registered id.
+
+    Args:
+        env_id: Id of the environment.
+        **options: Options of ``gym.make`` for this id.
 
     Raises:
-        ConfigurationError: an unknown id or option, or a value that is not allowed.
+        ConfigurationError: The id or an option is unknown, or a value is not allowed.
+
+    Example:
+        >>> import fusion_gym
+        >>> fusion_gym.parallel_env("fusion_gym/TobitOscillator-v1").possible_agents
+        ['sensor_0', 'sensor_1', 'sensor_2']
     """
     return FusionParallelEnv(make_task(env_id, **options))

@@ -1,6 +1,6 @@
-"""Vector environments for training, also with what no policy may know.
+"""Vector environments for training with the simulator's knowledge.
 
-Only credit and rewards are made of it, in training: what a policy sees is what it sees in use.
+Only rewards and credit assignment use this knowledge; observations are the task's own.
 """
 
 from typing import Any, NamedTuple
@@ -21,16 +21,17 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import refusal
 
-# In how many parts of the runs episodes begin at different times.
+# Groups of runs whose first episodes have different lengths.
 _GROUPS = 8
 
 
 class Branched(NamedTuple):
-    """What A other decisions would have brought, on the same noise.
+    """Rewards and observations after A alternative decisions on the same noise.
 
-    ``reward`` (A, N), scaled as the rewards of the step are, and ``observation`` (A, N, entries)
-    float32 of runs, of which a view makes the rows that are wanted. Of an episode that has ended
-    it is the state with which it would have gone on.
+    Attributes:
+        reward: (A, N), scaled as the rewards of the step.
+        observation: (A, N, entries) float32 of runs, before a view makes rows. For an ended episode
+            it belongs to the state without a reset.
     """
 
     reward: Array
@@ -38,16 +39,20 @@ class Branched(NamedTuple):
 
 
 class PrivilegedVecEnv(FusionSB3VecEnv):
-    """Stable-Baselines3's ``VecEnv`` with the simulator's own knowledge for credit and reward.
+    """Stable-Baselines3's ``VecEnv`` with the simulator's knowledge for rewards and credit.
 
-    ``error`` is the error's term of the rewards: ``"squared"``, the task's own, or ``"excess"`` or
-    ``"mismatch"`` (:meth:`~fusion_gym.core.reward.Reward.training_error`), for which ``reference``
-    is the system, on the same noise, whose filter takes in every measurement
-    (:func:`reference_system`). Returns in infos are those of the task.
+    Args:
+        task: The task.
+        num_envs: Number N of runs.
+        error: Error term of the rewards: ``"squared"`` is the task's own, ``"excess"`` and
+            ``"mismatch"`` are defined in :meth:`~fusion_gym.core.reward.Reward.training_error`. The
+            returns in infos are the task's.
+        reference: System on the same noise whose filter processes every measurement
+            (:func:`reference_system`), needed unless ``error`` is ``"squared"``.
+        **options: Keyword arguments of :class:`~fusion_gym.envs.sb3.FusionSB3VecEnv`.
 
     Raises:
-        ConfigurationError: an unknown kind, or one that needs a reference without one or with a
-            task whose own error is not squared.
+        ConfigurationError: ``error`` is unknown, or lacks a reference or the task's squared error.
     """
 
     def __init__(
@@ -70,16 +75,17 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         if error != "squared":
             self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)
         self._requests: NDArray[np.bool_] | None = None
-        self._observed: NDArray[np.float32] | None = None  # the rows, until an episode begins
+        self._observed: NDArray[np.float32] | None = None  # rows of the present step
         self._branched: Branched | None = None
 
     def step_alternatives(
         self, actions: NDArray[Any], requests: NDArray[np.bool_]
     ) -> tuple[VecEnvStepReturn, Branched]:
-        """One step of every run, and what other requests (A, sensors, N) would have brought.
+        """Make one step in every run, and evaluate other requests on the same noise.
 
-        Raises:
-            ValueError: an action that is not in the action space.
+        Args:
+            actions: Actions of the step, one per row.
+            requests: (A, sensors, N), the alternatives.
         """
         self._requests = requests
         try:
@@ -138,12 +144,15 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
 def reference_system(
     env_id: str, options: dict[str, Any], memory_filter: str | None = None
 ) -> System[Any]:
-    """The system whose filter takes in every measurement, of an environment with these options.
+    """Return the system of an environment whose filter processes every measurement.
 
-    Its filter is ``memory_filter``, by default the one that a memory has there.
+    Args:
+        env_id: Id of the environment.
+        options: Options of ``gym.make``.
+        memory_filter: Filter of the system; ``None`` takes the default filter of the memory.
 
     Raises:
-        ConfigurationError: an unknown id, option or filter.
+        ConfigurationError: The id, an option or the filter is unknown.
     """
     settings = {**options, "information": "sensors", "memory": True}
     if memory_filter is not None:
@@ -162,22 +171,27 @@ def make_sb3_vec_env(
     training_error: str = "squared",
     **options: Any,
 ) -> FusionSB3VecEnv:
-    """Return a native SB3 ``VecEnv`` of a registered environment.
+    """Return the Stable-Baselines3 ``VecEnv`` of a registered environment.
 
     Args:
-        env_id: the id of the environment.
-        num_envs: runs side by side.
-        seed: seed of run 0, for the next reset; run i gets ``seed + i``.
-        stagger: spread the lengths of the first episodes.
-        local: one row for each sensor of each run.
-        training_error: error's term of the rewards. ``"mismatch"`` and ``"excess"`` take off the
-            part of the error that no policy changes
-            (:meth:`~fusion_gym.core.reward.Reward.training_error`). Returns in infos stay the
-            task's.
-        options: options of ``gym.make``.
+        env_id: Id of the environment.
+        num_envs: Number N of runs.
+        seed: Seed of run 0 for the next reset; run i gets ``seed + i``.
+        stagger: Whether the lengths of the first episodes spread from 1 to the horizon.
+        local: Whether every sensor of every run is a row of its own.
+        training_error: Error term of the rewards. ``"excess"`` and ``"mismatch"`` subtract the part
+            that no policy changes (:meth:`~fusion_gym.core.reward.Reward.training_error`). The
+            returns in infos are always the task's.
+        **options: Options of ``gym.make`` for this id.
 
     Raises:
-        ConfigurationError: an unknown id or option, or a value that is not allowed.
+        ConfigurationError: The id or an option is unknown, or a value is not allowed.
+
+    Example:
+        >>> import fusion_gym
+        >>> envs = fusion_gym.make_sb3_vec_env("fusion_gym/TobitOscillator-v1", 4, seed=0)
+        >>> envs.num_envs, envs.reset().shape
+        (4, (4, 32))
     """
     task = make_task(env_id, **options)
     if training_error == "squared":

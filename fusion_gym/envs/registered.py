@@ -1,7 +1,7 @@
-"""The registered environments' classes, made from their options when they are first asked for.
+"""The classes of the registered environments, made from their options on first access.
 
-``TobitOscillatorEnv`` and ``TobitOscillatorVectorEnv`` are what ``gym.make`` and ``gym.make_vec``
-build for ``fusion_gym/TobitOscillator-v1``; ``help`` shows their page, with every option.
+``gym.make`` and ``gym.make_vec`` instantiate ``TobitOscillatorEnv`` and
+``TobitOscillatorVectorEnv`` for ``fusion_gym/TobitOscillator-v1``; ``help`` shows every option.
 """
 
 import inspect
@@ -17,7 +17,7 @@ from fusion_gym.envs.vector import FusionVectorEnv
 
 
 class _Page:
-    """A docstring that is written when it is first asked for; an object's tells of its own task."""
+    """A docstring that is written on first access, for an object from its own task."""
 
     def __init__(self, env_id: str) -> None:
         self._env_id = env_id
@@ -27,7 +27,7 @@ class _Page:
 
 
 def __getattr__(name: str) -> type:
-    """The class of this name, made once."""
+    """Return the environment class of this name, and cache it."""
     env_id = id_of(name)
     if env_id is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -60,7 +60,7 @@ def _vector(env_id: str) -> type:
 
 
 def _made(env_id: str, base: type, init: Any) -> type:
-    """A class whose signature shows every option with its default."""
+    """Return a class whose signature shows every option with its default."""
     own = list(inspect.signature(init).parameters.values())[:-1]
     named = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)

@@ -1,4 +1,4 @@
-"""The registered environments: an id stands for a ``build`` function from options to a scenario."""
+"""The registered environments: an id names a ``build`` function from options to a scenario."""
 
 import copy
 import importlib
@@ -30,14 +30,11 @@ _VERSION = re.compile(r"(?<=^fusion_gym/)(\w+)-v\d+$")
 
 
 class FusionSpec(EnvSpec):
-    """What Gymnasium knows of an environment, and every option with its type and default.
-
-    ``gymnasium.spec(id).pprint()`` lists them, ``env.unwrapped.spec.pprint()`` also what was given.
-    """
+    """Gymnasium's specification with the type and default of every option."""
 
     @classmethod
     def of(cls, spec: EnvSpec) -> EnvSpec:
-        """A copy of what Gymnasium knows, of this kind where the environment is registered."""
+        """Return a copy of a specification, a ``FusionSpec`` if this suite has the environment."""
         try:
             base_of(spec.id)
         except ConfigurationError:
@@ -47,7 +44,7 @@ class FusionSpec(EnvSpec):
 
     @property
     def options(self) -> dict[str, Option]:
-        """Type and default of every option, by its name."""
+        """Type and default of every option by name."""
         return options_in(options_of(self.id))
 
     def pprint(
@@ -56,7 +53,7 @@ class FusionSpec(EnvSpec):
         include_entry_points: bool = False,
         print_all: bool = False,
     ) -> str | None:
-        """See Gymnasium's; the options follow."""
+        """Print Gymnasium's text and the options, or return it with ``disable_print``."""
         lines = [f"    {option}" for option in list_options(self.options, self.kwargs)]
         text = super().pprint(True, include_entry_points, print_all)
         text = "\n".join([f"{text}", "options:", *lines])
@@ -79,26 +76,32 @@ ENVIRONMENTS: dict[str, str | Build] = {
 
 
 def class_name(env_id: str) -> str:
-    """Name of an environment's class in :mod:`fusion_gym.envs.registered`, without the ending.
-
-    ``fusion_gym/TobitOscillator-v1`` is TobitOscillator, ``mine/Tank-v1`` mine_Tank_v1.
-    """
+    """Return the class name of an id in :mod:`fusion_gym.envs.registered`, without the suffix."""
     own = _VERSION.sub(r"\1", env_id).removeprefix("fusion_gym/")
     return own if own.isidentifier() else "".join(c if c.isalnum() else "_" for c in env_id)
 
 
 def register(env_id: str | None = None, build: str | Build | None = None) -> None:
-    """Register an environment of your own with Gymnasium, or (no arguments) all of this suite.
+    """Register an environment with Gymnasium, or without arguments all environments of this suite.
 
-    ``build`` takes one argument, annotated with a dataclass that extends
-    :class:`~fusion_gym.core.options.CommonOptions`, and returns a
-    :class:`~fusion_gym.core.options.Scenario`; ``"module:function"`` names one that is imported
-    when it is needed (and by worker processes). After that ``gym.make``, ``gym.make_vec``,
-    :func:`make_task` and all faces know ``env_id``.
+    Afterwards ``gym.make``, ``gym.make_vec``, :func:`make_task` and all interfaces accept the id.
+
+    Args:
+        env_id: Id of the environment, such as ``"mine/Tank-v0"``.
+        build: Function from an options object to a :class:`~fusion_gym.core.options.Scenario`, or
+            its ``"module:function"``, which worker processes can import. The annotation of its
+            argument is a dataclass that extends :class:`~fusion_gym.core.options.CommonOptions`.
 
     Raises:
-        ConfigurationError: an id without a build function, or one that is taken.
-        gymnasium.error.Error: an id of another form than Gymnasium's.
+        ConfigurationError: ``build`` is missing, or the id is already registered.
+        gymnasium.error.Error: The id does not have Gymnasium's form.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.tobit.linear import build_linear
+        >>> fusion_gym.register("mine/Linear-v0", build_linear)
+        >>> fusion_gym.make_task("mine/Linear-v0", horizon=20).horizon
+        20
     """
     if env_id is not None:
         if build is None:
@@ -117,7 +120,7 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
 
 
 def id_of(name: str) -> str | None:
-    """The id whose class in :mod:`fusion_gym.envs.registered` has this name."""
+    """Return the id whose class in :mod:`fusion_gym.envs.registered` has this name, or ``None``."""
     classes = {f"{class_name(env_id)}{end}": env_id for env_id in ENVIRONMENTS for end in _CLASSES}
     return classes.get(name)
 
@@ -130,13 +133,13 @@ def present_id(name: str) -> str:
 def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
     """Return the environment of this suite behind an id, and the options of its registration.
 
-    ``module:id`` imports a module first, which registers the id. ``gymnasium.register`` may give an
-    id to a class of :mod:`fusion_gym.envs.registered`: its ``kwargs`` and ``max_episode_steps`` are
-    the options.
+    Args:
+        env_id: Id of this suite, id that ``gymnasium.register`` gives to a class of
+            :mod:`fusion_gym.envs.registered`, or ``module:id`` with a module to import first.
 
     Raises:
-        ConfigurationError: an unknown id, a module that cannot be imported, an entry point that is
-            no such class, or additional wrappers.
+        ConfigurationError: The id is unknown, its module cannot be imported, or its entry point is
+            another class or has wrappers.
     """
     if not isinstance(env_id, str):
         raise validation.refusal("env", env_id, "the id of an environment")
@@ -165,11 +168,7 @@ def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
 
 
 def build_of(env_id: str) -> Build:
-    """The ``build`` function behind an id.
-
-    Raises:
-        ConfigurationError: an id that :func:`base_of` does not know.
-    """
+    """Return the ``build`` function behind an id."""
     entry = ENVIRONMENTS[base_of(env_id)[0]]
     if not isinstance(entry, str):
         return entry
@@ -179,12 +178,7 @@ def build_of(env_id: str) -> Build:
 
 
 def options_of(env_id: str) -> type[CommonOptions]:
-    """The dataclass of an environment's options, with their defaults.
-
-    Raises:
-        ConfigurationError: an unknown id, or a build function whose argument is not annotated with
-            such a dataclass.
-    """
+    """Return the dataclass of an environment's options."""
     build = build_of(env_id)
     first = next(iter(inspect.signature(build).parameters), "")
     kind = typing.get_type_hints(build).get(first)
@@ -197,18 +191,23 @@ def options_of(env_id: str) -> type[CommonOptions]:
 
 
 def make_task(env: str | CommonOptions, /, **options: Any) -> Task:
-    """The task of a registered environment, everything checked before anything runs.
+    """Return the checked task of a registered environment.
 
-    ``env`` is an id, or ``module:id`` of one that a module registers, also by
-    ``gymnasium.register`` with an environment's class of this suite; to it ``options`` and what
-    every environment takes are added, or an options object such as
-    :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`. Every environment takes
-    ``max_episode_steps``, and ``system``, the path of a YAML file of options, which those beside it
-    replace.
+    Args:
+        env: Id, ``module:id`` with a module to import first, or an options object such as
+            :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`.
+        **options: Options of the id. Every id takes ``max_episode_steps`` and ``system``, the path
+            of a YAML file of options, which the other arguments replace. An options object takes
+            ``max_episode_steps`` only.
 
     Raises:
-        ConfigurationError: an id that is not registered, an unknown option, or a value that is
-            not allowed.
+        ConfigurationError: The id or an option is unknown, or a value is not allowed.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", horizon=50)
+        >>> task.horizon, task.sensors, task.system.state_names
+        (50, 3, ('x1', 'x2'))
     """
     validation.limit_options(options)
     if isinstance(env, str):
@@ -232,12 +231,14 @@ def make_task(env: str | CommonOptions, /, **options: Any) -> Task:
 
 
 def open_options(env_id: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of an environment with those of the file that ``system`` names, if it does.
+    """Return the options with the entries of the file ``system``.
 
-    What the id's own registration says goes before the file.
+    Args:
+        env_id: Id of the environment; options of its registration precede the file.
+        options: Options of a call, which replace entries of the file.
 
     Raises:
-        ConfigurationError: an id that is not registered, or a file that cannot be read.
+        ConfigurationError: The id is unknown, or the file cannot be read.
     """
     base, registered = base_of(env_id)
     if "system" not in options or "system" in {field.name for field in fields(options_of(base))}:
@@ -248,11 +249,7 @@ def open_options(env_id: str, options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _checked(build: Build, options: CommonOptions, limit: int | None) -> Task:
-    """The task, rehearsed if options were given, which an error names in any case.
-
-    A default may be what does not fit beside them, as the 2 entries of ``initial_mean`` beside a
-    ``transition`` of 3 states.
-    """
+    """Return the task, rehearsed if options differ from their defaults; errors list them."""
     args = {
         field.name: value
         for field in fields(options)

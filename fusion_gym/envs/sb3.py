@@ -19,30 +19,39 @@ from fusion_gym.envs.views import make_view
 
 
 class FusionSB3VecEnv(VecEnv):
-    """N runs of a task behind Stable-Baselines3's interface, without a wrapper in between.
+    """Run N episodes of a task behind Stable-Baselines3's ``VecEnv`` interface.
 
-    A run that ends is reset in the same step; its info then holds ``terminal_observation``,
-    ``TimeLimit.truncated`` and ``episode`` (return ``r``, length ``l``, seconds ``t``, tokens
-    ``cost``), which is also what SB3's monitor would write. The infos of all others are empty:
-    a dictionary a run and step would cost more than the step.
+    A run that ends is reset in the same step. Its info then has ``terminal_observation``,
+    ``TimeLimit.truncated`` and ``episode``: return ``r``, length ``l``, seconds ``t`` and tokens
+    ``cost``. All other infos are empty.
 
-    ``stagger`` spreads the lengths of the first episodes from 1 to the horizon. PPO asks for one
-    value of each truncated run, so episodes that all end together would stall it.
-
-    With ``local`` every sensor of every run is a row of its own, with the observation of
-    :class:`~fusion_gym.envs.views.SensorView` and the action space ``Discrete(2)``: one shared
-    policy learns what each sensor can run by itself. All rows of a run get the run's reward.
-
-    ``price_exponent``, from 0 to 1, is for training over a range of prices: an episode's rewards
-    are multiplied by :meth:`~fusion_gym.core.reward.Price.scale`. Returns in infos are not.
+    Args:
+        task: The task, as :func:`fusion_gym.make_task` returns it.
+        num_envs: Number N of runs.
+        stagger: Whether the lengths of the first episodes spread from 1 to the horizon. PPO
+            evaluates its value function once per truncated run, so simultaneous ends are slow.
+        local: Whether every sensor of every run is a row with the observation of
+            :class:`~fusion_gym.envs.views.SensorView`, the action space ``Discrete(2)`` and the
+            reward of its run.
+        price_exponent: Exponent from 0 to 1 of :meth:`~fusion_gym.core.reward.Price.scale`, which
+            multiplies the rewards, but not the returns in the infos.
 
     Attributes:
-        task: the task.
-        view: who looks and decides, the scheduler or every sensor.
-        observation_names: a name for each entry of an observation.
-        seconds: wall time spent in :meth:`step_wait` and :meth:`reset` so far.
-        totals: tokens spent and steps made so far, over all runs.
-        requests: made so far and granted so far, over all runs and sensors, in this process.
+        view: The view that makes the rows, of the scheduler or of every sensor.
+        observation_names: Name of each entry of an observation.
+        seconds: Wall time in :meth:`step_wait` and :meth:`reset` so far.
+        totals: Tokens and steps so far, summed over all runs.
+        requests: Numbers of requests and of grants so far, summed over all runs and sensors.
+
+    Raises:
+        ConfigurationError: An argument is not allowed, or the task's reward is a vector.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
+        >>> envs = fusion_gym.FusionSB3VecEnv(task, 4, local=True)
+        >>> envs.reset().shape
+        (12, 17)
     """
 
     def __init__(
@@ -76,11 +85,7 @@ class FusionSB3VecEnv(VecEnv):
         self._began = time.perf_counter()
 
     def reset(self) -> NDArray[np.float32]:
-        """New episodes in all runs, with the seeds and options set before (used once).
-
-        Raises:
-            ConfigurationError: an option was set; there are none.
-        """
+        """Begin new episodes in all runs with the seeds set before, and return the rows."""
         began = time.perf_counter()
         for option in self._options:
             validation.reset_options(option, [])
@@ -96,9 +101,10 @@ class FusionSB3VecEnv(VecEnv):
         return observation
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Run i gets ``seed + i`` at the next reset (with ``local``, all rows of a run the same).
+        """Set the seeds of the next reset and return the seed of every row.
 
-        Returns the seed of every row.
+        Args:
+            seed: Run i gets ``seed + i``, with ``local`` in all its rows; ``None`` draws a seed.
         """
         if seed is None:
             seed = int(np.random.randint(0, 2**32 - 1))  # noqa: NPY002
@@ -107,15 +113,11 @@ class FusionSB3VecEnv(VecEnv):
         return self._seeds
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Keep the actions for :meth:`step_wait`."""
+        """Store the actions for :meth:`step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """One step of every run.
-
-        Raises:
-            ValueError: an action that is not in the action space.
-        """
+        """Make one step in every run with the stored actions."""
         began = time.perf_counter()
         requests = self.view.requests(self._actions, self.runs)
         lengths, scale = self.batch.steps, self._scale()
@@ -135,7 +137,7 @@ class FusionSB3VecEnv(VecEnv):
         return result
 
     def snapshot(self) -> dict[str, Any]:
-        """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
+        """Return the state of all runs for :meth:`restore`, valid until the next step."""
         return {
             "batch": self.batch.snapshot(),
             "returns": self._returns,
@@ -144,7 +146,7 @@ class FusionSB3VecEnv(VecEnv):
         }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Put the runs where they were at a :meth:`snapshot` of an environment like this one."""
+        """Set all runs to a :meth:`snapshot` of an environment of the same task."""
         self.batch.restore(snapshot["batch"])
         self._returns = snapshot["returns"]
         self._spent = snapshot["spent"]
@@ -153,7 +155,7 @@ class FusionSB3VecEnv(VecEnv):
     def _finish(
         self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[dict[str, Any]]
     ) -> None:
-        """Write the infos of finished runs (one a row) and begin their next episodes."""
+        """Write the infos of finished runs and begin their next episodes."""
         final = self._observe()
         elapsed = round(time.perf_counter() - self._began, 6)
         for run in runs.tolist():
@@ -174,19 +176,19 @@ class FusionSB3VecEnv(VecEnv):
         self.batch.reset(runs)
 
     def _begin(self) -> None:
-        """New episodes in all runs."""
+        """Begin new episodes in all runs."""
         self.batch.reset(stagger=self.stagger)
 
     def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
-        """A step of the batch, before finished runs begin anew."""
+        """Step the batch, before finished runs are reset."""
         return self.batch.step(requests)
 
     def _reward(self, outcome: Outcome) -> Array:
-        """The rewards (N,) that are learned from."""
+        """Return the rewards (N,) for training, before scaling."""
         return outcome.reward
 
     def _scale(self) -> Array | float:
-        """What the rewards of the coming step are multiplied by, (N,)."""
+        """Return the factor (N,) of the coming step's rewards."""
         if self.price_exponent == 0.0:
             return 1.0
         return self.task.reward.price.scale(self.batch.price, self.price_exponent)
@@ -195,26 +197,19 @@ class FusionSB3VecEnv(VecEnv):
         return self.view.rows(self.batch.observe())
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Open choices (N, choices) for sb3-contrib's MaskablePPO.
-
-        Closed are requests that the network would not grant even alone.
-        """
+        """Return the choices (N, choices), bool, that the network can grant as a single request."""
         return self.view.masks(self.batch.grantable())
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing, because there are no resources to release."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of this environment, once for each index."""
+        """Return an attribute of this environment once per index."""
         value = getattr(self, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refused: the runs share one task, build another environment instead.
-
-        Raises:
-            AttributeError: always.
-        """
+        """Raise an ``AttributeError``, because all runs share one task."""
         raise AttributeError(
             f"cannot set {attr_name!r} of some runs: they share one task; make a new environment"
         )
@@ -226,18 +221,14 @@ class FusionSB3VecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """``action_masks``, one row a run; anything else is refused: runs are no objects.
-
-        Raises:
-            AttributeError: another method.
-        """
+        """Return the rows of ``action_masks``; other methods raise an ``AttributeError``."""
         if method_name == "action_masks":
             masks = self.action_masks()
             return [masks[run] for run in self._get_indices(indices)]
         raise AttributeError(f"the runs share one batch and have no method {method_name!r}")
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Whether a run is wrapped: ``Monitor`` counts as built in, anything else is absent."""
+        """Return ``True`` for ``Monitor``, whose infos are built in, else ``False``."""
         from stable_baselines3.common.monitor import Monitor
 
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]

@@ -1,4 +1,4 @@
-"""Gymnasium's single environment: the batched core with one run."""
+"""Gymnasium's single environment over the batched core."""
 
 import functools
 import sys
@@ -28,13 +28,30 @@ from fusion_gym.envs.views import SchedulerView
 
 
 class FusionEnv(Specified, gymnasium.Env[Any, Any]):
-    """One run of a task behind Gymnasium's interface.
+    """Run one episode of a task behind Gymnasium's interface.
 
-    An episode ends at the task's horizon, by truncation or with ``clock=True`` by termination. With
-    ``reward="vector"`` a reward is an array (2,), what the error and what the tokens cost.
+    An episode ends at the task's horizon: by truncation, or with ``clock=True`` by termination.
+    With ``reward="vector"`` a reward is an array (2,): the error term and the token term.
+
+    Args:
+        task: The task, as :func:`fusion_gym.make_task` returns it.
+        render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
 
     Attributes:
-        observation_names: a name for each entry of the observation.
+        observation_names: Name of each entry of the observation.
+
+    Raises:
+        ConfigurationError: The render mode is unknown, or its drawing package is absent.
+
+    Example:
+        >>> import fusion_gym
+        >>> env = fusion_gym.FusionEnv(fusion_gym.make_task("fusion_gym/TobitOscillator-v1"))
+        >>> observation, info = env.reset(seed=0)
+        >>> observation.shape, env.action_space
+        ((32,), MultiBinary(3))
+        >>> observation, reward, terminated, truncated, info = env.step([1, 0, 1])
+        >>> round(reward, 3), float(info["cost"])
+        (-1.272, 6.0)
     """
 
     metadata = {  # noqa: RUF012
@@ -49,7 +66,7 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         visible = self.render_mode == "human"
         self._window = Window(type(self).__name__, FRAMES_PER_SECOND) if visible else None
         self.batch = EpisodeBatch(task, 1)
-        self._seeded: np.random.Generator | None = None  # whose seed the batch has
+        self._seeded: np.random.Generator | None = None  # generator whose seed the batch uses
         self.view = SchedulerView(task)
         self.observation_names = self.view.names
         self.observation_space = self.view.space
@@ -60,10 +77,17 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], Infos]:
-        """A new episode. There are no options.
+        """Begin a new episode.
+
+        Args:
+            seed: Seed of the episodes; ``None`` begins the next episode of the present seed.
+            options: ``None`` or an empty mapping, because a reset has no options.
+
+        Returns:
+            The observation (entries,) and the info of a step without transmissions.
 
         Raises:
-            ConfigurationError: an unknown option.
+            ConfigurationError: ``options`` has an entry.
         """
         validation.reset_options(options, [])
         if self._seeded is None and _stepped_one_by_one():
@@ -81,11 +105,17 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         return self.batch.observe()[0], _first(reset_infos(self.task, 1))
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], Any, bool, bool, Infos]:
-        """One step; see the environment's documentation for the info.
+        """Make one step.
+
+        Args:
+            action: An element of ``action_space``.
+
+        Returns:
+            Observation (entries,), reward, ``terminated``, ``truncated`` and info.
 
         Raises:
-            ValueError: an action that is not in the action space.
-            ResetNeeded: before the first reset, or after the end of the episode.
+            ValueError: The action is not in the action space.
+            ResetNeeded: The episode has not begun or is over.
         """
         if self.batch.finished[0]:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
@@ -102,13 +132,13 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         return observation, reward, ended and clock, ended and not clock, infos
 
     def render(self) -> Frame | None:
-        """The picture (height, width, 3) of the present step; a window shows ``"human"``."""
+        """Return the picture (height, width, 3) of the present step with ``"rgb_array"``."""
         if self._film is None or self._window is not None:
             return None
         return self._film.frame()
 
     def close(self) -> None:
-        """The window, if there is one, is gone."""
+        """Close the window."""
         if self._window is not None:
             self._window.close()
 
@@ -117,12 +147,12 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
             self._window.show(self._film.frame())
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Open choices (choices,), for sb3-contrib's MaskablePPO."""
+        """Return the allowed choices (choices,), bool, as sb3-contrib's MaskablePPO reads them."""
         return self.view.masks(self.batch.grantable())[0]
 
 
 def _stepped_one_by_one() -> bool:
-    """Whether Stable-Baselines3 has wrapped the environment and resets it."""
+    """Return whether a ``DummyVecEnv`` of Stable-Baselines3 calls the reset."""
     frame = sys._getframe(2)
     while frame.f_back is not None:
         frame = frame.f_back
@@ -141,10 +171,13 @@ def _warn_of_single_steps() -> None:
 
 
 def _first(infos: Infos) -> Infos:
-    """The info of the only run: NumPy's numbers, and arrays without the batch axis.
+    """Return the info of the only run, each value with a ``dtype`` and without the batch axis.
 
-    Every value has a ``dtype``, which TorchRL asks for. A flag is an array without axes: of NumPy's
-    scalar flags Gymnasium's vector environments make arrays of objects.
+    TorchRL reads the ``dtype``. A flag is an array of shape (), because Gymnasium's vector
+    environments turn NumPy's scalar flags into objects.
+
+    Args:
+        infos: The info of a batch with one run.
     """
     return {
         key: np.array(value[0]) if value.ndim > 1 or value.dtype == np.bool_ else value[0]

@@ -26,18 +26,14 @@ FRAMES_PER_SECOND = 10
 
 
 class Specified:
-    """An environment whose specification knows the length of its episodes.
-
-    ``horizon`` decides on it, and no wrapper of Gymnasium's: what asks the specification for
-    ``max_episode_steps`` (``TimeAwareObservation``, other libraries) is told the same.
-    """
+    """An environment whose specification has the task's horizon as ``max_episode_steps``."""
 
     task: Task
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium knows of the environment; ``None`` of one that it has not made."""
+        """Gymnasium's specification of the environment, or ``None`` without ``gym.make``."""
         return self._spec
 
     @spec.setter
@@ -48,18 +44,34 @@ class Specified:
 
 
 class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
-    """N runs of a task behind Gymnasium's vector interface.
+    """Run N episodes of a task behind Gymnasium's vector interface.
 
-    Episodes end at the task's horizon, by truncation or with ``clock=True`` by termination; rewards
-    are (N,), with ``reward="vector"`` (N, 2). ``autoreset_mode`` is
-    any of Gymnasium's: ``NEXT_STEP`` (the default), ``SAME_STEP`` (with ``final_obs`` and
-    ``final_info``) or ``DISABLED`` (reset with ``options={"reset_mask": mask}``).
+    Episodes end at the task's horizon: by truncation, or with ``clock=True`` by termination.
+    Rewards have the shape (N,), or (N, 2) with ``reward="vector"``.
+
+    Args:
+        task: The task, as :func:`fusion_gym.make_task` returns it.
+        num_envs: Number N of runs.
+        autoreset_mode: ``NEXT_STEP``, ``SAME_STEP`` (with ``final_obs`` and ``final_info``) or
+            ``DISABLED`` (reset with ``options={"reset_mask": mask}``).
+        render_mode: ``"rgb_array"`` or ``None``.
 
     Attributes:
-        observation_names: a name for each entry of an observation.
+        observation_names: Name of each entry of an observation.
 
     Raises:
-        ConfigurationError: ``num_envs`` is not a whole number >= 1, or an unknown mode.
+        ConfigurationError: ``num_envs`` is not a whole number >= 1, or a mode is unknown.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
+        >>> envs = fusion_gym.FusionVectorEnv(task, num_envs=4)
+        >>> observations, infos = envs.reset(seed=0)
+        >>> observations.shape
+        (4, 32)
+        >>> rewards = envs.step(envs.action_space.sample())[1]
+        >>> rewards.shape
+        (4,)
     """
 
     def __init__(
@@ -99,13 +111,18 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[NDArray[np.float32], Infos]:
-        """New episodes in all runs, or in those of ``options["reset_mask"]``.
+        """Begin new episodes in all runs, or in the runs of ``options["reset_mask"]``.
 
-        Run i gets the seed ``seed + i`` (or the i-th of a sequence); without a seed its noise
-        goes on where it stood.
+        Args:
+            seed: A number gives run i the seed ``seed + i``; a sequence has one seed per run.
+                ``None`` begins the next episode of the present seed.
+            options: ``None``, or ``{"reset_mask": mask}`` with ``mask`` (N,) bool.
+
+        Returns:
+            Observations (N, entries) and the infos of a step without transmissions.
 
         Raises:
-            ValueError: seeds or a mask of the wrong length or kind, or an unknown option.
+            ValueError: Seeds or mask have a wrong length or type, or an option is unknown.
         """
         seeds: Sequence[int | None]
         if seed is None:
@@ -134,13 +151,13 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         return self.batch.observe(), _with_mask(reset_infos(self.task, self.num_envs), mask)
 
     def render(self) -> tuple[Frame, ...] | None:
-        """A picture (height, width, 3) of every run; nothing without a render mode."""
+        """Return a picture (height, width, 3) of every run, or ``None`` without a render mode."""
         if self._film is None:
             return None
         return tuple(self._film.frame(run) for run in range(self.num_envs))
 
     def _renew(self, runs: NDArray[np.bool_]) -> None:
-        """New episodes in these runs."""
+        """Begin new episodes in ``runs``, a mask (N,)."""
         self.batch.reset(np.flatnonzero(runs))
         if self._film is not None:
             self._film.begin(np.flatnonzero(runs))
@@ -167,11 +184,17 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
     def step(
         self, actions: Any
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], Infos]:
-        """One step of every run; see the environment's documentation for the info.
+        """Make one step in every run.
+
+        Args:
+            actions: An element of ``action_space``.
+
+        Returns:
+            Observations (N, entries), rewards, ``terminated`` (N,), ``truncated`` (N,) and infos.
 
         Raises:
-            ValueError: an action that is not in the action space.
-            ResetNeeded: before the first reset, or (``DISABLED``) in a finished run.
+            ValueError: An action is not in the action space.
+            ResetNeeded: A run was never reset, or with ``DISABLED`` a run is finished.
         """
         if not self._started.all():
             raise gymnasium.error.ResetNeeded("call reset before the first step")
@@ -205,11 +228,7 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
 
 
 def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MODES) -> str | None:
-    """The render mode, or none.
-
-    Raises:
-        UnexpectedArgumentError: another one than ``modes``.
-    """
+    """Return the render mode if it is ``None`` or one of ``modes``."""
     if render_mode is not None and render_mode not in modes:
         listed = ", ".join(map(repr, modes))
         raise validation.UnexpectedArgumentError.of(
@@ -221,29 +240,25 @@ def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MOD
 
 
 def rewards_of(task: Task, outcome: Outcome) -> NDArray[np.float64]:
-    """The rewards (N,) of a step, or (N, 2): what the error and what the tokens cost."""
+    """Return the rewards (N,) of a step, or (N, 2) with error term and token term."""
     if not task.vector_reward:
         return outcome.reward
     return np.stack([outcome.reward_error, outcome.reward_communication], axis=-1)
 
 
 def refuse_vector_reward(task: Task, where: str) -> None:
-    """Some faces take one number alone.
-
-    Raises:
-        ConfigurationError: the task's reward has two.
-    """
+    """Raise a ``ConfigurationError`` if the task's reward is a vector."""
     if task.vector_reward:
         raise validation.refusal("reward", "vector", "'scalar'", where)
 
 
 def reward_space() -> Box:
-    """The space of a vector of rewards, as MO-Gymnasium asks for it."""
+    """Return the space of vector rewards, as MO-Gymnasium requires it."""
     return Box(-np.inf, 0.0, (2,), np.float64)
 
 
 def step_infos(outcome: Outcome) -> Infos:
-    """The info of a step as arrays with the batch axis first, without masks."""
+    """Return the info of a step as arrays with the batch axis first, without masks."""
     return {
         "cost": outcome.cost,
         "cost_tokens": outcome.cost,
@@ -257,7 +272,7 @@ def step_infos(outcome: Outcome) -> Infos:
 
 
 def reset_infos(task: Task, num_envs: int) -> Infos:
-    """The info of a reset: nothing was spent, granted or denied, and no error was made."""
+    """Return the info of a reset: zeros, as in a step without requests and errors."""
     none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
     nobody = np.zeros((task.sensors, num_envs), dtype=np.bool_)
     error = np.zeros((len(task.system.state_names), num_envs))
@@ -266,7 +281,7 @@ def reset_infos(task: Task, num_envs: int) -> Infos:
 
 
 def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:
-    """The infos with zeros in the given runs, as after a reset."""
+    """Return the infos with zeros in ``runs``, a mask (N,)."""
     return {
         key: np.where(runs.reshape(-1, *[1] * (value.ndim - 1)), np.zeros((), value.dtype), value)
         for key, value in infos.items()
@@ -274,7 +289,7 @@ def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:
 
 
 def _with_mask(infos: Infos, mask: NDArray[np.bool_]) -> Infos:
-    """Gymnasium's vector form: beside every key the mask of the runs for which it holds."""
+    """Return the infos in Gymnasium's vector form, each key with its mask of valid runs."""
     result: Infos = {}
     for key, value in infos.items():
         result[key] = value.copy()

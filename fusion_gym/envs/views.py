@@ -1,9 +1,8 @@
-"""Who looks and decides: a scheduler of all sensors, or every sensor by itself.
+"""Views of a batch: one row per decision, of a scheduler or of every local sensor.
 
-A view turns a batch's observations into rows, one for each decision of a policy, and the
-decisions into requests. It has ``names`` of a row's entries, the ``space`` of a row, float32, and
-that of its ``actions``, ``rows_per_run``, which stand together, the ``knowledge`` that a row shows,
-and the ``owner`` whose memory a batch keeps for it, where the task has memory.
+A view turns observations into rows and actions into requests. Its attributes are ``names`` of the
+entries, ``space`` (float32) of a row, ``actions`` (the action space), ``rows_per_run`` (adjacent
+rows of a run), ``knowledge`` (class of a row) and ``owner`` (of the batch's memory, or ``None``).
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ Requests = NDArray[np.bool_]
 
 
 class SchedulerView:
-    """One row a run: the task's whole observation, and a decision for all sensors.
+    """One row per run: the task's observation, and a decision for all sensors.
 
-    The action space is ``MultiBinary(sensors)``; with ``action="discrete"`` it is
-    ``Discrete(2**sensors)``, the requests as bits of one number, sensor 0 lowest; with
-    ``access="single"`` it is ``Discrete(sensors + 1)``, 0 for nobody, m for sensor m - 1.
+    The action space is ``MultiBinary(sensors)``. With ``action="discrete"`` it is
+    ``Discrete(2**sensors)`` for the number Σ u_m 2^m, and with ``access="single"`` it is
+    ``Discrete(sensors + 1)``: 0 is no request, m is sensor m - 1.
     """
 
     rows_per_run = 1
@@ -48,16 +47,19 @@ class SchedulerView:
             self.actions = spaces.Discrete(2**task.sensors)
 
     def rows(self, observation: Rows) -> Rows:
-        """The observations themselves."""
+        """Return the observations unchanged."""
         return observation
 
     def requests(self, actions: Any, runs: int | None) -> Requests:
-        """Return the requests (sensors, N) that actions (N, sensors) or (N,) stand for, N ``runs``.
+        """Return the requests (sensors, N) of actions (N, sensors) or (N,).
 
-        ``None`` stands for one run, whose action comes without an axis of runs.
+        Args:
+            actions: Actions of N runs, or of one run without the axis N.
+            runs: Number N of runs; ``None`` is one run without the axis N.
 
         Raises:
-            ValueError: actions of another shape, not finite, or outside the action space.
+            ValueError: The actions have another shape, are not finite, or are not in the action
+                space.
         """
         shape = self.actions.shape or ()
         array = _numbers(actions, shape if runs is None else (runs, *shape))
@@ -69,10 +71,13 @@ class SchedulerView:
         return self._decoded(array.astype(np.int64).reshape(-1))
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
-        """Return the open choices (N, choices) where sensors (sensors, N) may request.
+        """Return the allowed choices (N, choices) in the layout of sb3-contrib's MaskablePPO.
 
-        In the layout of sb3-contrib's MaskablePPO: two choices a sensor for ``MultiBinary``,
-        silence and a request; for ``Discrete`` a choice a number, closed if any of its requests is.
+        ``MultiBinary`` has two choices per sensor, silence and a request. ``Discrete`` has one
+        choice per number, which is allowed if all its requests are.
+
+        Args:
+            allowed: (sensors, N), whether the sensor may request.
         """
         if isinstance(self.actions, spaces.Discrete):
             requested = self._decoded(np.arange(self.actions.n))
@@ -82,26 +87,28 @@ class SchedulerView:
         return result.reshape(len(result), -1)
 
     def _decoded(self, numbers: NDArray[np.int64]) -> Requests:
-        """The requests (sensors, …) that whole numbers stand for."""
+        """Return the requests (sensors, …) of whole numbers."""
         sensors = np.arange(self._sensors)[:, None]
         return numbers == sensors + 1 if self._single else (numbers >> sensors & 1).astype(np.bool_)
 
 
 class SensorView:
-    """One row for each sensor of each run: what it sees by itself, and its own decision.
+    """One row per sensor and run: the observation of a local sensor, and its own decision.
 
-    A sensor sees the entries that its own node knows, what all nodes are told (the token level,
-    the price, an estimate that is fed back) and, unless the task's ``own_number`` is off, its own
-    number. With ``broadcast="estimate"`` it also sees the centre's own entries, with ``"packets"``
-    all that the centre knows.
+    A sensor observes the entries of its own node, the broadcast entries (token level, price, an
+    estimate that the centre feeds back) and, with ``own_number``, its own number. With
+    ``broadcast="estimate"`` it also observes the centre's estimate, and with ``"packets"``
+    everything that the centre knows.
 
-    Row run · sensors + sensor belongs to that sensor of that run; ``names`` are without the
-    sensor's index. The action space is ``Discrete(2)``, 1 for a request: one shared policy, honest
-    for deployment.
+    Row ``run * sensors + sensor`` belongs to that sensor; ``names`` omit the sensor's index. The
+    action space is ``Discrete(2)``, in which 1 is a request, so one policy serves all sensors.
+
+    Args:
+        task: The task.
 
     Raises:
-        ConfigurationError: a task whose information is not "sensors", whose packets only a
-            scheduler can fill, or whose sensors do not see the same kinds of entries.
+        ConfigurationError: The task has ``information="centre"``, ``packet="estimate"``, or sensors
+            with different kinds of entries.
     """
 
     def __init__(self, task: Task) -> None:
@@ -133,7 +140,7 @@ class SensorView:
             )
         self._columns = np.array(columns)
         self.rows_per_run = count
-        # Which sensor it is, one-hot: a row a sensor, (sensors, sensors) or without entries.
+        # One-hot number of the sensor: (sensors, sensors), or (sensors, 0) without it.
         self._identity = np.eye(count, dtype=np.float32)[:, : count if task.own_number else 0]
         identity = [f"sensor[{sensor}]" for sensor in range(self._identity.shape[1])]
         self.names = (*names[0], *(layout.names[place] for place in received), *identity)
@@ -143,18 +150,18 @@ class SensorView:
         self.actions: spaces.Discrete[Any] = spaces.Discrete(2)
 
     def rows(self, observation: Rows) -> Rows:
-        """Turn observations (N, scheduler's entries) into rows (N·sensors, entries)."""
+        """Return rows (N·sensors, entries) of observations (N, entries of the scheduler)."""
         observed = observation[:, self._columns]
         shared = np.broadcast_to(self._identity, (len(observation), *self._identity.shape))
         return np.concatenate((observed, shared), axis=-1).reshape(-1, len(self.names))
 
     def requests(self, actions: Any, runs: int | None) -> Requests:
-        """Return the requests (sensors, N) of actions (N·sensors,), 1 for a request, run by run."""
+        """Return the requests (sensors, N) of actions (N·sensors,), in which 1 is a request."""
         values = _numbers(actions, ((1 if runs is None else runs) * self.rows_per_run,))
         return np.ascontiguousarray(_ones(values).reshape(-1, self.rows_per_run).T)
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
-        """Return the open choices (N·sensors, 2), silence and a request."""
+        """Return the allowed choices (N·sensors, 2): silence and a request."""
         return np.stack((np.ones(allowed.size, dtype=np.bool_), allowed.T.ravel()), axis=1)
 
 
@@ -162,26 +169,18 @@ View = SchedulerView | SensorView
 
 
 def make_view(task: Task, local: bool = False) -> View:
-    """The scheduler's view of a task, or with ``local`` the one that every sensor has.
-
-    Raises:
-        ConfigurationError: a local view of a task that has none (:class:`SensorView`).
-    """
+    """Return the scheduler's view of a task, or the sensors' view with ``local``."""
     return SensorView(task) if local else SchedulerView(task)
 
 
 def is_received(entry: ObservationEntry, broadcast: str) -> bool:
-    """Whether every sensor sees an entry."""
+    """Return whether every sensor observes an entry."""
     received = {"none": False, "estimate": entry.centre and entry.sensor is None}
     return entry.broadcast or received.get(broadcast, entry.centre)
 
 
 def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """The actions as an array of numbers of this shape.
-
-    Raises:
-        ValueError: anything else.
-    """
+    """Return the actions as a numeric array of this shape, or raise a ``ValueError``."""
     try:
         values = np.asarray(actions)
     except ValueError:
@@ -200,7 +199,7 @@ def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _ones(values: NDArray[Any]) -> Requests:
-    """Where the actions are 1; all others must be 0."""
+    """Return where the actions are 1; the others must be 0."""
     requests: Requests = values == 1
     _check(values, requests | (values == 0), "0 or 1")
     return requests

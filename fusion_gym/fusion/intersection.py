@@ -1,8 +1,8 @@
-"""Covariance intersection and its inverse form of two estimates, and of several in turn.
+"""Covariance intersection and its inverse form, of two estimates and of several in turn.
 
-In the coordinates in which both covariances are diagonal (:func:`diagonalise`) the two-estimate
-rules are scalar, and their trace is a convex sum whose minimum :func:`best_weight` finds. More
-than two at once: :mod:`fusion_gym.fusion.several`.
+In coordinates that make both covariances diagonal (:func:`diagonalise`) the rules for two estimates
+are scalar, and their trace is a convex sum with the minimum :func:`best_weight`.
+:mod:`fusion_gym.fusion.several` joins more than two estimates at once.
 """
 
 from collections.abc import Callable
@@ -19,20 +19,24 @@ from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
 from fusion_gym.validation import refusal
 
 _ORTHOGONAL = 1e-13  # cosine below which two rows count as orthogonal
-_SWEEPS = 30  # cap of the rotations; sizes up to 6 need fewer than 10 sweeps
-_HALVINGS = 24  # of the interval of weights; the trace is then within 2^-25 of its optimum
-REGULAR = 1e-4  # part of a state's variance that the other states must leave unexplained
-_DEPENDENT = 1e-24  # part of a row's squared norm below which other rows explain it
+_SWEEPS = 30  # largest number of sweeps; sizes up to 6 need fewer than 10
+_HALVINGS = 24  # bisections; the trace is then within 2^-25 of its optimum
+REGULAR = 1e-4  # least share of a state's variance that other states do not explain
+_DEPENDENT = 1e-24  # share of a row's squared norm below which it counts as dependent
 _FLAT = 1e-12  # relative slope below which the weight makes no difference
 
 
 class DiagonalPair(NamedTuple):
     """Two covariances P_A = V diag(a) Vᵀ and P_B = V diag(b) Vᵀ with a + b = 1.
 
-    ``basis`` Vᵀ (n, n, N), rows of zeros where both know a direction exactly · ``inverse`` V⁺
-    (n, n, N) · ``first`` a and ``second`` b (n, N) · ``power`` c (n, N), the squared norms of the
-    columns of V, so that a covariance V diag(p) Vᵀ has the trace Σ c_j p_j ·
-    ``uncertain`` (n, N), the states of which neither variance is zero.
+    Attributes:
+        basis: Vᵀ (n, n, N), with rows of zeros where both variances are zero.
+        inverse: V⁺ (n, n, N).
+        first: a (n, N).
+        second: b (n, N).
+        power: Squared norms c (n, N) of the columns of V, so that V diag(p) Vᵀ has the trace Σ c_j
+            p_j.
+        uncertain: (n, N), whether both variances of a state are positive.
     """
 
     basis: Array
@@ -45,10 +49,16 @@ class DiagonalPair(NamedTuple):
 
 @np.errstate(all="ignore")
 def orthonormalise(roots: Array) -> Array:
-    """Coordinates in which Σ F_i F_iᵀ is the identity, from the roots F_i (l, n, n, N).
+    """Return coordinates in which Σ F_i F_iᵀ is the identity.
 
-    Rows (n, (l + 2) n, N) of (W_1, …, W_l, T, Vᵀ) with F_i = V W_i and T V = I, zeros from the rank
-    on: the Gram-Schmidt method, which takes the row of which the largest part is left.
+    The Gram-Schmidt method takes the row with the largest remaining part next.
+
+    Args:
+        roots: F_i (l, n, n, N).
+
+    Returns:
+        Rows (n, (l + 2) n, N) of (W_1, …, W_l, T, Vᵀ) with F_i = V W_i and T V = I, zeros from the
+        rank on.
     """
     count, size, _, runs = roots.shape
     width, lanes = count * size, np.arange(runs)
@@ -74,12 +84,17 @@ def orthonormalise(roots: Array) -> Array:
 def diagonalise(
     covariance_a: Array, covariance_b: Array, metric: Array | None = None
 ) -> DiagonalPair:
-    """Both covariances (n, n, N), positive semi-definite, in common diagonal coordinates.
+    """Return two covariances in common diagonal coordinates.
 
-    With P_A = C Cᵀ, the rows of G = C⁻¹ chol(P_B) are made orthogonal: their squared norms are
-    b / a, each to its own relative accuracy. The rotations turn Cᵀ into Vᵀ and C⁻¹ into V⁻¹. Where
-    P_A or P_B is nearly singular, the rows of :func:`orthonormalise` replace G: first the rows of
-    P_A are made orthogonal, then the rows of P_B, for the first do not tell where b is small.
+    With P_A = C Cᵀ, rotations make the rows of G = C⁻¹ chol(P_B) orthogonal: their squared norms
+    are b / a, each with a small relative error. The rotations turn Cᵀ into Vᵀ and C⁻¹ into V⁻¹.
+    Where P_A or P_B is nearly singular, the rows of :func:`orthonormalise` replace G: first the
+    rows of P_A are made orthogonal, then the rows of P_B, because the first do not resolve small b.
+
+    Args:
+        covariance_a: P_A (n, n, N), positive semi-definite.
+        covariance_b: P_B (n, n, N), positive semi-definite.
+        metric: G (n, n, N) of the trace of G P Gᵀ; the identity by default.
     """
     pair = np.stack(np.broadcast_arrays(covariance_a, covariance_b))
     size, factor = len(covariance_a), linalg.cholesky(pair)
@@ -113,8 +128,10 @@ def diagonalise(
 def _orthogonalise(rows: Array) -> None:
     """Rotate rows (n, m, N) until their first n entries are orthogonal (one-sided Jacobi method).
 
-    A lane whose rows are orthogonal is left untouched, so that its result does not depend on the
-    others.
+    Runs with orthogonal rows remain unchanged, so that a result does not depend on other runs.
+
+    Args:
+        rows: (n, m, N), changed in place.
     """
     size = len(rows)
     for _ in range(_SWEEPS):
@@ -126,7 +143,7 @@ def _orthogonalise(rows: Array) -> None:
 
 
 def _rotate(first: Array, second: Array, size: int) -> bool:
-    """Make the first n entries of two rows (m, N) orthogonal; False where they all were."""
+    """Make the first n entries of two rows (m, N) orthogonal; return False if they all were."""
     product = linalg.dot(first[:size], second[:size])
     norm_first = linalg.dot(first[:size], first[:size])
     norm_second = linalg.dot(second[:size], second[:size])
@@ -150,10 +167,15 @@ def _rotate(first: Array, second: Array, size: int) -> bool:
 
 @np.errstate(all="ignore")
 def best_weight(numerator: Array, start: Array, end: Array) -> Array:
-    """The ω in [0, 1] (N,) at which Σ_j g_j / ((1 - ω) s_j + ω e_j) is smallest.
+    """Return the ω in [0, 1] (N,) that minimises Σ_j g_j / ((1 - ω) s_j + ω e_j).
 
-    ``numerator`` g, ``start`` s and ``end`` e are positive, (n, N). Bisection on the sign of the
-    slope of this convex function; ω is 1/2 where the sum is constant to rounding.
+    Bisection on the sign of the slope of this convex function; ω is 1/2 where the sum is constant
+    to rounding.
+
+    Args:
+        numerator: g > 0 (n, N).
+        start: s > 0 (n, N).
+        end: e > 0 (n, N).
     """
     change = end - start
     factor = numerator * change
@@ -181,7 +203,7 @@ def best_weight(numerator: Array, start: Array, end: Array) -> Array:
 def _join(
     mean_a: Array, mean_b: Array, pair: DiagonalPair, fused: Array, share: Array, weight: Array
 ) -> Fused:
-    """Back from the diagonal coordinates: P = V diag(fused) Vᵀ and L = V diag(share) V⁻¹."""
+    """Return P = V diag(fused) Vᵀ and the mean with L = V diag(share) V⁻¹."""
     scaled = pair.basis * np.sqrt(fused)[:, None] * pair.uncertain
     second = linalg.matmul(linalg.transpose(pair.basis), pair.inverse * share[:, None])
     return Fused(
@@ -199,21 +221,24 @@ def covariance_intersection(
     covariance_b: Array,
     basis: Array | None = None,
 ) -> Fused:
-    """Covariance intersection of two estimates, of the smallest trace.
+    """Return the covariance intersection of two estimates with the smallest trace.
 
     P = (ω P_A⁻¹ + (1 - ω) P_B⁻¹)⁻¹, K = ω P P_A⁻¹ and L = (1 - ω) P P_B⁻¹. P bounds the fused
     error's covariance whatever the correlation of the two errors, provided that P_A and P_B bound
     theirs. Where ω is 0 or 1 one estimate is dropped; for equal covariances ω is 1/2.
 
     Args:
-        mean_a, mean_b: (n, N).
-        covariance_a, covariance_b: (n, n, N), symmetric positive semi-definite. What one of them
-            knows exactly the result knows too. A batch axis of length 1 broadcasts.
-        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
+        mean_a: (n, N).
+        covariance_a: P_A (n, n, N), symmetric positive semi-definite. A direction with zero
+            variance in one estimate has zero variance in the result. A batch axis of length 1
+            broadcasts.
+        mean_b: (n, N).
+        covariance_b: P_B (n, n, N), as P_A.
+        basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with the gains K, L and the weights ω, 1 - ω. Its trace is within a
-        relative 1e-6 of the optimum. A lane with a NaN is NaN, except for the weights.
+        relative 1e-6 of the optimum. A run with a NaN is NaN, except for the weights.
 
     Assumes: P_A and P_B bound their own error covariances; nothing of the correlation of the
     two.
@@ -228,10 +253,7 @@ def covariance_intersection(
 def _intersect(
     covariance_a: Array, covariance_b: Array, basis: Array | None
 ) -> tuple[DiagonalPair, Array, Array, Array]:
-    """The pair, the weight ω of the smallest trace, the variances p and b's shares in the mean.
-
-    p = a b / (ω b + (1 - ω) a), and zero where one of them is, for every ω.
-    """
+    """Return the pair, the best ω, the variances p = a b / (ω b + (1 - ω) a) and b's shares."""
     pair = diagonalise(covariance_a, covariance_b, basis)
     both = pair.first * pair.second
     start, end = np.where(both > 0.0, pair[2:4], 1.0)
@@ -244,10 +266,12 @@ def _intersect(
 def best_of_pair(
     covariances: Array, selected: NDArray[np.bool_], basis: Array | None
 ) -> tuple[Array, Array]:
-    """Covariance intersection where two of l estimates are ``selected`` (l, N).
+    """Return weights (l, N) and covariance (n, n, N) of the covariance intersection of a pair.
 
-    Weights (l, N) and covariance (n, n, N) of the smallest trace, from ``covariances``
-    (l, n, n, N).
+    Args:
+        covariances: (l, n, n, N).
+        selected: (l, N), two estimates per run.
+        basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
     """
     first = selected.argmax(0)
     second = len(selected) - 1 - selected[::-1].argmax(0)
@@ -282,15 +306,14 @@ def inverse_covariance_intersection(
     covariance_b: Array,
     basis: Array | None = None,
 ) -> Fused:
-    """Inverse covariance intersection of two estimates, of the smallest trace.
+    """Return the inverse covariance intersection of two estimates with the smallest trace.
 
-    With X = (ω P_A + (1 - ω) P_B)⁻¹: P = (P_A⁻¹ + P_B⁻¹ - X)⁻¹, K = P (P_A⁻¹ - ω X) and
-    L = P (P_B⁻¹ - (1 - ω) X). In the diagonal coordinates, with t = ω a² + (1 - ω) b²,
-    p = a b + (a b)² / t and L = ω a² / t. Never above the trace
-    of covariance intersection.
+    With X = (ω P_A + (1 - ω) P_B)⁻¹: P = (P_A⁻¹ + P_B⁻¹ - X)⁻¹, K = P (P_A⁻¹ - ω X) and L = P
+    (P_B⁻¹ - (1 - ω) X). In the diagonal coordinates, with t = ω a² + (1 - ω) b², p = a b + (a b)² /
+    t and L = ω a² / t. The trace never exceeds the trace of covariance intersection.
 
-    **P is not a bound for every correlation.** It is one where both estimates contain the same
-    piece of information and nothing else is common: P_A⁻¹ = A⁻¹ + G, P_B⁻¹ = B⁻¹ + G with
+    **P is not a bound for every correlation.** It is a bound if both estimates contain the same
+    information and share nothing else: P_A⁻¹ = A⁻¹ + G, P_B⁻¹ = B⁻¹ + G with
     independent errors of covariances A, B and G⁻¹ (A, B may be infinite), so that the errors'
     cross-covariance is P_A G P_B with G at most P_A⁻¹ and P_B⁻¹. Then P minus the actual
     covariance is ω (1 - ω) P X [P_A + P_B - P_A G P_B - P_B G P_A] X P, and since
@@ -299,14 +322,17 @@ def inverse_covariance_intersection(
     noise is not of this form, and Theorem 5 of the paper, which claims a bound for it, fails.
 
     Args:
-        mean_a, mean_b: (n, N).
-        covariance_a, covariance_b: (n, n, N), symmetric positive semi-definite. What one of them
-            knows exactly the result knows too. A batch axis of length 1 broadcasts.
-        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
+        mean_a: (n, N).
+        covariance_a: P_A (n, n, N), symmetric positive semi-definite. A direction with zero
+            variance in one estimate has zero variance in the result. A batch axis of length 1
+            broadcasts.
+        mean_b: (n, N).
+        covariance_b: P_B (n, n, N), as P_A.
+        basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with the gains K, L and the weights ω, 1 - ω. Its trace is within a
-        relative 1e-6 of the optimum. A lane with a NaN is NaN, except for the weights.
+        relative 1e-6 of the optimum. A run with a NaN is NaN, except for the weights.
 
     Assumes: common information of the structure above; nothing else that both estimates share.
 
@@ -327,18 +353,19 @@ def inverse_covariance_intersection(
 class SequentialIntersection(FusionRule):
     r"""Join the first estimate with each other one in turn, two at a time.
 
-    ``join`` is :func:`covariance_intersection`, a bound for every correlation, or
-    :func:`inverse_covariance_intersection`, smaller, a bound for common information only.
-    ``order`` is the order of arrival, a permutation of the estimates 0 to l - 1; ``None`` stands
-    for 0, 1, 2, ... The result depends on it. In each lane the first active estimate is taken as
-    it is, and only lanes in which the next one is active cost time.
+    In each run the first active estimate is the start of the sequence.
+
+    Args:
+        join: :func:`covariance_intersection`, a bound for every correlation, or
+            :func:`inverse_covariance_intersection`, smaller, a bound for common information only.
+        order: Order of arrival, a permutation of the estimates 0 to l - 1; ``None`` stands for
+            0, 1, 2, ... The result depends on it.
 
     Raises:
-        ConfigurationError: an order that is no permutation, or not one of the l estimates.
+        ConfigurationError: ``order`` is no permutation of the l estimates.
 
     Equation:
-        With covariance intersection, for one estimate i after the other, in the order of arrival
-        (``order``):
+        With covariance intersection, for each estimate i in the order of arrival (``order``):
 
         $$
         P\leftarrow\left(\omega P^{-1}+(1-\omega)P_i^{-1}\right)^{-1},\qquad \hat x\leftarrow
@@ -357,9 +384,9 @@ class SequentialIntersection(FusionRule):
         X\right),\qquad L=P_{\mathrm{new}}\left(P_i^{-1}-(1-\omega)X\right)
         $$
 
-        Each ω is that of the smallest trace; K + L = I.
+        Each ω minimises the trace; K + L = I.
 
-    Assumes: what ``join`` assumes, at every step.
+    Assumes: the assumption of ``join`` at every step.
 
     Source: adaptive_innovation, equations (37) to (40) and (47) to (52), gains by (56) and (59);
     S. J. Julier and J. K. Uhlmann, "A non-divergent estimation algorithm in the presence of unknown
@@ -376,7 +403,7 @@ class SequentialIntersection(FusionRule):
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
-        """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
+        """Return the fused active estimates."""
         own = own_covariances(covariance)
         count, _, runs = means.shape
         self._check_order(count)
@@ -420,7 +447,7 @@ class SequentialIntersection(FusionRule):
 
 
 class _Step(NamedTuple):
-    """An ``estimate`` is the ``first`` (N,) of some lanes and a ``pair`` with others' results."""
+    """An ``estimate``, the runs (N,) where it is ``first``, and its ``pair`` in other runs."""
 
     estimate: int
     first: NDArray[np.bool_]
@@ -429,7 +456,7 @@ class _Step(NamedTuple):
 
 
 def _chained(steps: list[_Step], shape: tuple[int, ...]) -> Array:
-    """The gains (l, n, n, N) of all steps: each takes its share from those before."""
+    """Return the gains (l, n, n, N) of all steps, each step's share times all later gains."""
     gains = np.zeros(shape)
     joined: list[int] = []
     for estimate, first, lanes, pair in steps:
@@ -445,5 +472,5 @@ def _chained(steps: list[_Step], shape: tuple[int, ...]) -> Array:
 
 
 def _lanes(array: Array, lanes: slice | NDArray[np.intp]) -> Array:
-    """These lanes with the batch axis contiguous, which plain indexing would not leave it."""
+    """Return these runs with a contiguous batch axis."""
     return array if isinstance(lanes, slice) else array.take(lanes, axis=-1)

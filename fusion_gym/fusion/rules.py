@@ -1,6 +1,6 @@
-"""What a fusion rule is, what it returns, and the two rules in closed form.
+"""The interface of a fusion rule, its result, and the two rules in closed form.
 
-A rule in a file of its own is a subclass of :class:`FusionRule` and one row of the table in
+A new rule is a subclass of :class:`FusionRule` and a row of the table in
 :mod:`fusion_gym.fusion.table`.
 """
 
@@ -15,21 +15,22 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 
-Active = NDArray[np.bool_] | None  # (l, N), the estimates that take part; all by default
+Active = NDArray[np.bool_] | None  # (l, N), the active estimates; all by default
 
-# Relative. Above the rounding of Σ, so that weights stay below 1e6 and their covariance honest to
-# 1e-4 in the worst case (1e-9 in the usual one); below any difference of estimates that matters.
+# Relative ridge above the rounding of Σ: weights stay below 1e6, their covariance is accurate to
+# 1e-4 in the worst case and usually to 1e-9.
 _RIDGE = 1e-12
 
 
 @dataclass(frozen=True)
 class Fused:
-    """The l estimates joined: x = Σ G_i x_i with Σ G_i = I.
+    """The fused estimate of l estimates: x = Σ G_i x_i with Σ G_i = I.
 
-    ``mean`` (n, N) · ``covariance`` (n, n, N), what the rule claims · ``weights`` (l, N), where a
-    rule weighs covariances, >= 0 with sum 1. The gains are computed when they are first read, by
-    ``find_gains``, whatever has become of the estimates by then. A lane in which no estimate takes
-    part is NaN.
+    Args:
+        mean: (n, N), NaN in a run without active estimates.
+        covariance: Claimed covariance (n, n, N).
+        find_gains: Function that computes the gains on first access.
+        weights: (l, N), >= 0 with sum 1, of a rule that weighs covariances.
     """
 
     mean: Array
@@ -39,7 +40,7 @@ class Fused:
 
     @cached_property
     def gains(self) -> Array:
-        """G (l, n, n, N), zero for an estimate that takes no part.
+        """G (l, n, n, N), zero for an inactive estimate.
 
         The actual covariance of the result is Σ_ij G_i P̄_ij G_jᵀ with the actual covariances P̄_ij
         of the estimates.
@@ -48,29 +49,35 @@ class Fused:
 
 
 class FusionRule(ABC):
-    """Joins the estimates of several nodes, or of a centre and its nodes, in one."""
+    """A rule that joins the estimates of several nodes, or of a centre and its nodes."""
 
     @abstractmethod
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
-        """The active estimates joined.
+        """Return the fused active estimates.
 
         Args:
             means: (l, n, N).
-            covariance: the estimates' own, (l, n, n, N), or the joint one of their errors,
-                (l, l, n, n, N), of which most rules read the diagonal blocks alone.
-            active: (l, N), the estimates that take part; all by default. Others are not read.
-            basis: G (n, n, N) where the estimates, and the result, are of z with x = G z; weights
-                then minimise the trace of G P Gᵀ. The identity by default.
+            covariance: The estimates' own, (l, n, n, N), or the joint one of their errors,
+                (l, l, n, n, N), of which most rules read only the diagonal blocks.
+            active: (l, N) bool, the estimates to join; all by default. Others are not read.
+            basis: G (n, n, N) if the estimates and the result are of z with x = G z; weights then
+                minimise the trace of G P Gᵀ. The identity by default.
         """
 
     def fuse_single(
         self, silent: Array, delivered: Array, basis: Array | None = None
     ) -> tuple[Array, Array]:
-        """Fused covariances if nobody delivers (n, n, N), and (l, n, n, N) if each alone does.
+        """Return the fused covariances without a delivery and after single deliveries.
 
-        From the nodes' own covariances without and with a delivery, both (l, n, n, N).
+        Args:
+            silent: The nodes' covariances (l, n, n, N) without a delivery.
+            delivered: The nodes' covariances (l, n, n, N) after a delivery.
+            basis: As in :meth:`fuse`.
+
+        Returns:
+            (n, n, N) without a delivery, and (l, n, n, N), entry i after node i's delivery only.
         """
         nowhere = np.zeros(silent.shape[:2] + silent.shape[-1:])
         single = np.empty(silent.shape)
@@ -82,7 +89,7 @@ class FusionRule(ABC):
 
 
 def own_covariances(covariance: Array) -> Array:
-    """The estimates' own covariances (l, n, n, N), also where the joint one is given."""
+    """Return the estimates' own covariances (l, n, n, N), also from the joint covariance."""
     if covariance.ndim == 4:
         return covariance
     return linalg.symmetrise(np.stack([covariance[i, i] for i in range(len(covariance))]))
@@ -92,24 +99,24 @@ def own_covariances(covariance: Array) -> Array:
 class InformationFusion(FusionRule):
     r"""Sum of the informations of independent estimates: P = (Σ P_i⁻¹)⁻¹, x = P Σ P_i⁻¹ x_i.
 
-    It has no parameters. The result is optimal for independent errors, and for those of nodes
-    that share a prior in shares of its information. A prior that several estimates have in full
-    is counted as often as they do, and P is then too small.
+    It has no parameters. The result is optimal for independent errors, and for nodes that share a
+    prior in shares of its information. If several estimates contain a whole prior, the sum counts
+    it once per estimate, and P is too small.
 
     Equation:
         $$
         P=\left(\sum_i P_i^{-1}\right)^{-1},\qquad \hat x=P\sum_i P_i^{-1}x_i
         $$
 
-        Of nodes that get the estimate back in shares wᵢ (``information_shares``):
+        For nodes that receive the estimate in shares wᵢ (``information_shares``):
 
         $$
         P_i\leftarrow P/w_i,\qquad x_i\leftarrow\hat x,\qquad \sum_i w_i=1
         $$
 
-        so that the prior is counted once when the informations are added up.
+        so that the sum counts the prior once.
 
-    Assumes: independent errors, or nodes whose common prior was shared out among them.
+    Assumes: independent errors, or nodes with shares of one common prior.
 
     Source: tobit_token_bucket, equation (50).
     """
@@ -117,7 +124,7 @@ class InformationFusion(FusionRule):
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
-        """See :class:`FusionRule`; a lane with a covariance that is not definite is NaN."""
+        """Return the fused active estimates, NaN where a covariance is not definite."""
         information = linalg.inverse(own_covariances(covariance))
         if active is not None:
             information = np.where(active[:, None, None], information, 0.0)
@@ -129,7 +136,7 @@ class InformationFusion(FusionRule):
     def fuse_single(
         self, silent: Array, delivered: Array, basis: Array | None = None
     ) -> tuple[Array, Array]:
-        """See :class:`FusionRule`: informations are sums."""
+        """Return fused covariances from sums of informations."""
         information = linalg.inverse(silent)
         total = information.sum(0)
         gained = linalg.inverse(delivered) - information
@@ -141,11 +148,11 @@ class MatrixWeightedFusion(FusionRule):
     r"""x = Σ A_i x_i with Σ A_i = I and the smallest error variance of all such sums.
 
     It needs the joint covariance. The weights of (56), (eᵀ Σ⁻¹ e)⁻¹ eᵀ Σ⁻¹ with e a column of
-    identities, are those of the best linear correction of the first estimate by the differences
+    identities, equal the best linear correction of the first estimate by the differences
     D_i = x_i - x_1 of the others, x = x_1 - Cov(x_1, D) Cov(D)⁻¹ D. In this form the weights add
-    up to I exactly, and Σ itself may be singular: it is whenever two estimates are the same. Then
-    Cov(D) is singular too, and a relative ridge of 1e-12 on it stands for its pseudo-inverse. The
-    result is that of (eᵀ T⁺ e)⁺ eᵀ T⁺ with T = Σ + e eᵀ. The covariance is
+    up to I exactly, and Σ may be singular, as for two equal estimates. Then
+    Cov(D) is singular too, and a relative ridge of 1e-12 approximates its pseudo-inverse. The
+    result is (eᵀ T⁺ e)⁺ eᵀ T⁺ with T = Σ + e eᵀ. The covariance is
     weights · Σ · weightsᵀ of the given Σ, the true one for these weights.
 
     Equation:
@@ -164,7 +171,7 @@ class MatrixWeightedFusion(FusionRule):
     """
 
     def weights(self, joint: Array) -> Array:
-        """Weights A (l, n, n, N) for a joint covariance (l, l, n, n, N)."""
+        """Return the weights A (l, n, n, N) for a joint covariance (l, l, n, n, N)."""
         count, n, runs = len(joint), joint.shape[2], joint.shape[-1]
         weights = np.zeros((count, n, n, runs))
         for state in range(n):
@@ -175,12 +182,12 @@ class MatrixWeightedFusion(FusionRule):
         spread = joint[1:, 1:] - joint[0, 1:] - toward[:, None]
         own = linalg.diagonal(own_covariances(joint))
         ridge = _RIDGE * (own[0] + own[1:])
-        ridge[ridge < np.finfo(np.float64).tiny] = 1.0  # of what all know exactly
+        ridge[ridge < np.finfo(np.float64).tiny] = 1.0  # where all variances are zero
         size = (count - 1) * n
         spread = spread.swapaxes(1, 2).reshape(size, size, runs)
         ridge, toward = ridge.reshape(size, runs), toward.reshape(size, n, runs)
         solved = linalg.solve(linalg.add_diagonal(spread, ridge), toward)
-        (lanes,) = np.nonzero(np.isnan(solved).any((0, 1)))  # rounding has left it indefinite
+        (lanes,) = np.nonzero(np.isnan(solved).any((0, 1)))  # rounding made it indefinite
         if lanes.size:
             definite = linalg.gram(linalg.root(spread[..., lanes]))
             definite = linalg.add_diagonal(definite, ridge[:, lanes])
@@ -192,12 +199,13 @@ class MatrixWeightedFusion(FusionRule):
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
-        """See :class:`FusionRule`.
+        """Return the fused active estimates.
 
         Args:
             means: (l, n, N).
-            covariance: (l, l, n, n, N), that of all errors, positive semi-definite.
-            active: (l, N); all by default.
+            covariance: Joint covariance (l, l, n, n, N) of all errors, positive semi-definite.
+            active: (l, N) bool; all by default.
+            basis: Ignored, because the weights do not depend on it.
         """
         if active is not None:
             return self._fuse_sets(means, covariance, active)
@@ -209,7 +217,7 @@ class MatrixWeightedFusion(FusionRule):
         return Fused(mean, linalg.congruence(row, sigma), lambda: weights)
 
     def _fuse_sets(self, means: Array, joint: Array, active: NDArray[np.bool_]) -> Fused:
-        """Lanes with the same active estimates together, as if there were no others."""
+        """Return the fused estimates, one call of :meth:`fuse` per set of active estimates."""
         mean, fused = np.full(means.shape[1:], np.nan), np.full(joint.shape[2:], np.nan)
         gains = np.zeros(joint.shape[1:])
         for selected in np.unique(active, axis=1).T:

@@ -1,7 +1,7 @@
 """Covariance intersection of several estimates at once, batch axis last.
 
-The trace of the fused covariance is a convex function of the weights. Most lanes need no search:
-one estimate alone is the best, or only two take part (:mod:`fusion_gym.fusion.intersection`).
+The trace of the fused covariance is a convex function of the weights. Most runs need no search: one
+estimate has the smallest trace, or only two are active (:mod:`fusion_gym.fusion.intersection`).
 The others take Newton steps on the simplex of weights.
 """
 
@@ -23,8 +23,8 @@ from fusion_gym.fusion.intersection import (
 from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
 
 _GAP = 1e-6  # relative optimality gap at which the search ends
-_STEPS = 100  # cap of its steps; most lanes need four, ill-conditioned ones up to about thirty
-_NOTHING = 1e-22  # part of the least variance of each state below which a direction is known
+_STEPS = 100  # largest number of steps; most runs need 4, ill-conditioned ones about 30
+_NOTHING = 1e-22  # share of a state's least variance below which a direction counts as known
 _RIDGE = 1e-10  # keeps the curvature invertible where estimates are alike
 
 
@@ -33,8 +33,8 @@ class CovarianceIntersection(FusionRule):
     r"""Covariance intersection of all estimates at once (:func:`covariance_intersection_many`).
 
     Like its sequential form it bounds the actual covariance for every correlation of the errors.
-    Where ``active`` leaves one estimate alone it is taken as it is. The smallest trace depends on
-    the units of the single states: a state in a smaller unit has larger numbers and counts more.
+    A single active estimate is returned unchanged. The smallest trace depends on the units of the
+    states: a state in a smaller unit has larger numbers and a larger weight.
 
     Equation:
         $$
@@ -45,8 +45,8 @@ class CovarianceIntersection(FusionRule):
         w=\arg\min\ \mathrm{tr}\,P\quad\text{over}\quad w_i\ge0,\ \ \sum_i w_i=1
         $$
 
-        Any weights give a bound. In ``UnknownInput-v1`` ``ci`` follows the minimum from step to
-        step to within 1 % of the trace, and ``exact_ci`` finds it at every step.
+        All weights give a bound. In ``UnknownInput-v1`` ``ci`` tracks the minimum to within 1 % of
+        the trace, and ``exact_ci`` computes it at every step.
 
     Assumes: the P_i bound their own error covariances; nothing of their correlations.
 
@@ -57,7 +57,7 @@ class CovarianceIntersection(FusionRule):
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
-        """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
+        """Return the fused active estimates."""
         own = own_covariances(covariance)
         if active is None:
             return covariance_intersection_many(means, own, basis=basis)
@@ -85,28 +85,27 @@ class CovarianceIntersection(FusionRule):
 def covariance_intersection_many(
     means: Array, covariances: Array, active: Active = None, basis: Array | None = None
 ) -> Fused:
-    """Covariance intersection of l estimates at once, of the smallest trace.
+    """Return the covariance intersection of l estimates with the smallest trace.
 
     P = (Σ w_i P_i⁻¹)⁻¹ and x = P Σ w_i P_i⁻¹ x_i with w_i >= 0 and Σ w_i = 1: a bound for every
     correlation of the errors, as with two estimates. With Y_i = P_i⁻¹ the trace of P exceeds its
-    minimum by at most the gap max_i tr(P Y_i P) - tr P.
+    minimum by at most the gap max_i tr(P Y_i P) - tr P. Newton's method needs four to thirty steps;
+    the multiplicative update w_i <- w_i sqrt(tr(P Y_i P)) needs thousands where estimates are
+    alike.
 
     Args:
         means: (l, n, N).
-        covariances: (l, n, n, N), symmetric positive semi-definite where active. What one estimate
-            knows exactly the result knows too, as in the limit of weights above zero.
-        active: (l, N), the estimates that take part; all by default. Others are not read and get
-            the weight 0.
-        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
+        covariances: (l, n, n, N), symmetric positive semi-definite where active. A direction with
+            zero variance in one estimate has zero variance in the result.
+        active: (l, N) bool, the estimates to join; all by default. Others are not read and get the
+            weight 0.
+        basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with its weights w (l, N). The search ends at a gap of a relative 1e-6,
-        or after 100 steps of a lane (each lowers the trace or shortens the one before). Where two
-        estimates take part the trace is within a relative 1e-6 of the optimum. In a lane without
-        active estimates, and in one with a NaN, mean and covariance are NaN.
-
-    The multiplicative update w_i <- w_i sqrt(tr(P Y_i P)) has the same optimum, but where
-    estimates are alike thousands of its steps do not reach it. Newton's need four to thirty.
+        or after 100 steps of a run. With two active estimates the trace is within a relative 1e-6
+        of the optimum. In a run without active estimates or with a NaN, mean and covariance are
+        NaN.
 
     Assumes: the P_i bound their own error covariances; nothing of their correlations.
 
@@ -159,7 +158,7 @@ def covariance_intersection_many(
 
 
 def is_regular(covariance: Array, information: Array) -> NDArray[np.bool_]:
-    """Whether an inverse (..., n, n, N) is accurate to some 12 digits, (..., N)."""
+    """Return whether an inverse (..., n, n, N) is accurate to some 12 digits, (..., N)."""
     inflation = linalg.diagonal(covariance) * linalg.diagonal(information)
     return np.asarray((REGULAR * inflation < 1.0).all(-2))
 
@@ -167,11 +166,15 @@ def is_regular(covariance: Array, information: Array) -> NDArray[np.bool_]:
 def _constrained(
     covariances: Array, selected: NDArray[np.bool_], basis: Array
 ) -> tuple[Array, Array, Array]:
-    """Gains (l, n, n, N), weights (l, N) and covariance where a covariance is nearly singular.
+    """Return gains (l, n, n, N), weights (l, N) and covariance for nearly singular covariances.
 
-    What one estimate knows exactly the result knows too, as in the limit of weights above zero.
-    The rest is x = x_0 + R u: x_0 joins the estimates as if they were independent, with the
+    The result is x = x_0 + R u: x_0 joins the estimates as if they were independent, with the
     covariance R Rᵀ, so that all Rᵀ P_i⁻ R are at most the identity.
+
+    Args:
+        covariances: P_i (l, n, n, N).
+        selected: (l, N).
+        basis: (n, n, N).
     """
     size = len(basis)
     own = np.where(selected[:, None, None], covariances, linalg.identity(size))
@@ -184,7 +187,7 @@ def _constrained(
     information = linalg.matmul(linalg.transpose(legs), legs)
     information = linalg.add_diagonal(
         information, np.where(root.any(0), 0.0, 1.0)
-    )  # of a u without meaning
+    )  # for unused directions
     information *= selected[:, None, None]
     start = selected / selected.sum(0)
     weights, inside = _search(information, linalg.matmul(basis, root), start)
@@ -196,7 +199,7 @@ def _constrained(
 
 
 def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
-    """Inverses (l, n, n, N) of the chosen covariances, zero elsewhere."""
+    """Return the inverses (l, n, n, N) of the selected covariances, zero elsewhere."""
     if selected.all():
         return linalg.inverse(covariances)
     information = np.zeros_like(covariances)
@@ -207,12 +210,12 @@ def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
 
 
 def _of(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
-    """The given lanes, contiguous; indexing would make the batch axis the slowest in memory."""
+    """Return the given runs with a contiguous batch axis."""
     return array.take(lanes, axis=-1)
 
 
 def sum_rows(rows: Array) -> Array:
-    """Sum over the first axis, in the same order for every number of lanes."""
+    """Return the sum over the first axis, in the same order for every number of runs."""
     total: Array = rows[0].copy()
     for row in rows[1:]:
         total += row
@@ -220,21 +223,28 @@ def sum_rows(rows: Array) -> Array:
 
 
 def _total(terms: Array) -> Array:
-    """Sum over the second-last axis, in the same order for every number of lanes."""
+    """Return the sum over the second-last axis, in the same order for every number of runs."""
     if terms.shape[-1] > 1:
         total: Array = terms.sum(-2)
         return total
-    return sum_rows(np.moveaxis(terms, -2, 0))  # NumPy would sum what is contiguous in pairs
+    return sum_rows(np.moveaxis(terms, -2, 0))  # NumPy sums contiguous axes in pairs
 
 
 def _best_alone(
     covariances: Array, information: Array, basis: Array, selected: NDArray[np.bool_]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """All weight on the active estimate of the smallest trace; where it is not the optimum.
+    """Return weights and covariance of the single best estimate, and where it is not optimal.
+
+    Args:
+        covariances: (l, n, n, N).
+        information: (l, n, n, N), the inverses.
+        basis: (n, n, N).
+        selected: (l, N).
 
     Returns:
-        Weights (l, N), covariance (n, n, N), and the lanes (N,) that have a gap or a NaN. Where
-        nobody is active the weights are zero, the covariance is NaN, and there is no search.
+        Weights (l, N), covariance (n, n, N), and the runs (N,) with a gap or a NaN. In a run
+        without active estimates the weights are zero, the covariance is NaN, and there is no
+        search.
     """
     spread = linalg.matmul(covariances, linalg.transpose(basis))
     traces = np.where(selected, linalg.trace(linalg.matmul(basis, spread)), np.inf)
@@ -250,17 +260,14 @@ def _best_alone(
 
 
 def _gain(information: Array, spread: Array) -> Array:
-    """tr(Y_i S Sᵀ) (l, N) of S = P Gᵀ, by which the trace of G P Gᵀ falls with each weight."""
+    """Return tr(Y_i S Sᵀ) (l, N) of S = P Gᵀ, the negative gradient of the trace of G P Gᵀ."""
     square = linalg.matmul(spread, linalg.transpose(spread))
     product = information * square
     return _total(product.reshape(len(information), len(square) ** 2, -1))
 
 
 def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Array]:
-    """Weights (l, N) and covariance (n, n, N) of the smallest trace, from ``start`` (l, N).
-
-    A step that does not lower the trace is halved until it does.
-    """
+    """Return weights (l, N) and covariance (n, n, N) of the smallest trace, from ``start``."""
     weights, fused = start.copy(), np.empty_like(information[0])
     lanes = np.arange(start.shape[-1])
     old, new, lowest = start, start, np.full(lanes.size, np.inf)
@@ -293,7 +300,7 @@ def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Arra
 
 
 def _weighted(weights: Array, information: Array) -> Array:
-    """Σ w_i Y_i, (n, n, N)."""
+    """Return Σ w_i Y_i, (n, n, N)."""
     total: Array = weights[0] * information[0]
     for weight, item in zip(weights[1:], information[1:], strict=True):
         total += weight * item
@@ -301,14 +308,14 @@ def _weighted(weights: Array, information: Array) -> Array:
 
 
 def _inverse_root(matrix: Array) -> Array:
-    """The upper triangular U (n, n, N) with U Uᵀ the inverse; NaN where it is not definite."""
+    """Return the upper triangular U (n, n, N) with U Uᵀ the inverse, NaN if not definite."""
     size = len(matrix)
-    stack = np.zeros((2 * size, size, matrix.shape[-1]))  # rows n and up turn from I into U
+    stack = np.zeros((2 * size, size, matrix.shape[-1]))  # rows from n on become U
     stack[:size] = matrix
     for k in range(size):
         stack[size + k, k] = 1.0
         pivot = np.sqrt(stack[k, k])
-        pivot /= stack[k, k]  # NaN for what is not positive
+        pivot /= stack[k, k]  # NaN where it is not positive
         column = stack[k + 1 : size + k + 1, k]
         column *= pivot
         if k + 1 < size:
@@ -319,18 +326,26 @@ def _inverse_root(matrix: Array) -> Array:
 def _newton(
     information: Array, weights: Array, root: Array, spread: Array, gain: Array, total: Array
 ) -> Array:
-    """The weights (l, N) at which the trace's quadratic model is smallest, none of them negative.
+    """Return the non-negative weights (l, N) that minimise the trace's quadratic model.
 
     With S = P Gᵀ the gradient is -``gain`` and the curvature H_ij = 2 tr(Sᵀ Y_i P Y_j S). The trace
     is homogeneous of degree -1, so H w = 2 ``gain`` and the model is tᵀ H t / 2 - 3 ``gain``ᵀ t.
-    Free are the estimates of positive weight and those of a gain above the trace. While the
-    minimum has a negative weight, the weights go towards it as far as they can, and the estimate
-    whose weight is then zero is free no longer. Where rounding leaves no descent, weight goes from
-    the estimate of the smallest gain to that of the largest.
+    Free are the estimates of positive weight and of a gain above the trace. While the minimum has a
+    negative weight, the weights move towards it up to the boundary, and the estimate whose weight
+    becomes zero is no longer free. Where rounding leaves no descent, weight moves from the estimate
+    of the smallest gain to the estimate of the largest.
+
+    Args:
+        information: Y_i (l, n, n, N).
+        weights: w (l, N).
+        root: U (n, n, N) with P = U Uᵀ.
+        spread: S (n, n, N).
+        gain: (l, N).
+        total: Trace (N,).
     """
     free = (weights > 0.0) | (gain > total)
     somewhere = free.any(1)
-    if not somewhere.all():  # estimates without a part in any lane cost no time
+    if not somewhere.all():  # skip estimates that are inactive in every run
         target = np.zeros_like(weights)
         target[somewhere] = _newton(
             information[somewhere], weights[somewhere], root, spread, gain[somewhere], total
@@ -359,7 +374,7 @@ def _newton(
 
 
 def _as_far(weights: Array, target: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The last weights (l, N) on the way to the target that are not negative, and what blocks."""
+    """Return the last non-negative weights (l, N) towards the target, and the blocking ones."""
     reach = np.full_like(weights, np.inf)
     np.divide(weights, weights - target, out=reach, where=target < 0.0)
     length = reach.min(0)
@@ -369,10 +384,7 @@ def _as_far(weights: Array, target: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _curvature(information: Array, root: Array, spread: Array) -> Array:
-    """2 tr(Sᵀ Y_i P Y_j S), (l, l, N), for i <= j; zero below.
-
-    With P = U Uᵀ it is twice the inner product of the Uᵀ Y_i S.
-    """
+    """Return 2 tr(Sᵀ Y_i P Y_j S), (l, l, N), for i <= j, zero below."""
     count, size, _, runs = information.shape
     legs = linalg.matmul(information, spread)
     for row in range(size - 1, -1, -1):
@@ -388,10 +400,7 @@ def _curvature(information: Array, root: Array, spread: Array) -> Array:
 
 
 def _model_minimum(curvature: Array, gain: Array, free: NDArray[np.bool_]) -> Array:
-    """The t (l, N) of sum 1, zero outside ``free``, at which tᵀ H t / 2 - 3 gainᵀ t is smallest.
-
-    Elimination reads the upper triangle of H alone, and a ridge keeps its pivots positive.
-    """
+    """Return t (l, N), Σ t = 1, zero outside ``free``, that minimises tᵀ H t / 2 - 3 gainᵀ t."""
     count, mask = len(gain), free * 1.0
     work = np.zeros((count, count + 2, gain.shape[-1]))
     for i in range(count):
@@ -414,7 +423,7 @@ def _model_minimum(curvature: Array, gain: Array, free: NDArray[np.bool_]) -> Ar
 
 
 def _exchange(weights: Array, gain: Array, curvature: Array) -> Array:
-    """Weight moved from the estimate of the smallest gain to that of the largest, (l, N)."""
+    """Return weights (l, N) after a move from the estimate of the smallest gain to the largest."""
     lanes = np.arange(weights.shape[-1])
     most = gain.argmax(0)
     least = np.where(weights > 0.0, gain, np.inf).argmin(0)

@@ -1,4 +1,4 @@
-"""The fusion rules by name: what each assumes of the estimates, and why it is refused elsewhere."""
+"""The fusion rules by name, their assumptions, and the reasons for a refusal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from fusion_gym.fusion.rules import FusionRule, InformationFusion, MatrixWeighte
 from fusion_gym.fusion.several import CovarianceIntersection
 from fusion_gym.validation import ConfigurationError
 
-MOST_TOGETHER = 40  # sensors whose estimates a rule joins at once, at a cost of their cube
+MOST_TOGETHER = 40  # sensors of a rule with cubic cost
 Assumption = Literal[
     "nothing",
     "common information",
@@ -27,8 +27,8 @@ Assumption = Literal[
     "tracked weights",
 ]
 
-# Why a rule is refused where its assumption does not hold. The inverse intersections assume common
-# information, and they are offered without it, as their papers do: they are then no bound.
+# Reasons for the refusal of a rule. Without common information the inverse intersections are no
+# bound, but they are offered, as in their papers.
 REASONS: dict[Assumption, str] = {
     "independence": (
         "the errors of these estimates are correlated ({common}), and adding their information "
@@ -45,12 +45,15 @@ REASONS: dict[Assumption, str] = {
 
 @dataclass(frozen=True)
 class FusionRow:
-    """A row of the table.
+    """A row of the table of fusion rules.
 
-    ``make`` gives the rule, for an ``order`` of arrival where it has one; the docstring of its
-    class has the equation, the assumption and the source. ``assumes`` is what it needs to hold for
-    its covariance to be a bound, ``pair`` means exactly two estimates, ``ordered`` that the order
-    belongs to it, and ``cubic`` that its cost grows with the cube of the number of estimates.
+    Args:
+        make: Function that returns the rule, for an ``order`` of arrival if it has one.
+        assumes: Assumption under which its covariance is a bound.
+        meaning: Short description.
+        pair: Whether it joins exactly two estimates.
+        ordered: Whether it has an order of arrival.
+        cubic: Whether its cost grows with the cube of the number of estimates.
     """
 
     make: Callable[..., FusionRule]
@@ -94,10 +97,12 @@ RULES = {
 
 @dataclass(frozen=True)
 class Structure:
-    """What is known of the errors of the estimates that a centre joins.
+    """The correlation structure of the errors of the estimates that a centre joins.
 
-    ``common`` says in words what makes them correlated, ``holds`` are the assumptions that hold
-    all the same, and ``prediction`` says that estimate 0 is the centre's own prediction.
+    Args:
+        common: Cause of the correlation, in words.
+        holds: Assumptions that hold nevertheless.
+        prediction: Whether estimate 0 is the centre's own prediction.
     """
 
     common: str
@@ -106,11 +111,11 @@ class Structure:
 
     @property
     def offered(self) -> tuple[str, ...]:
-        """Names of the rules that are sound for these estimates."""
+        """Names of the rules whose assumption holds for these estimates."""
         return tuple(name for name, rule in RULES.items() if self.refusal(rule) is None)
 
     def refusal(self, rule: FusionRow) -> str | None:
-        """Why the rule is not for these estimates, or ``None``."""
+        """Return the reason why the rule is refused for these estimates, or ``None``."""
         if rule.assumes in self.holds or rule.assumes not in REASONS:
             return None
         return REASONS[rule.assumes].format(common=self.common)
@@ -119,15 +124,17 @@ class Structure:
 def choose_rule(
     name: Any, structure: Structure, sensors: int, order: ArrayLike | None = None
 ) -> FusionRule:
-    """The rule of the options ``fusion`` and ``order`` for the estimates of so many sensors.
+    """Return the rule of the options ``fusion`` and ``order``.
 
-    ``order`` is the sensors' order of arrival; a prediction comes before all of them.
+    Args:
+        name: Name of a rule.
+        structure: Structure of the estimates' errors.
+        sensors: Number of sensors.
+        order: Order of arrival of the sensors; the centre's prediction precedes them.
 
     Raises:
-        ConfigurationError: an unknown rule, one that is unsound for this structure, "ici" for
-            other than two estimates, more than 40 sensors for a rule that is cubic in them, an
-            order for a rule that has none, or one that is no permutation of the sensors 0 to
-            l - 1.
+        ConfigurationError: The rule is unknown, refused for this structure or this number of
+            estimates, or ``order`` is no permutation or does not belong to the rule.
     """
     known = structure.offered
     if isinstance(name, str) and name in RULES and name not in known:

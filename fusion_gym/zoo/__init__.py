@@ -1,8 +1,7 @@
-"""Trained agents, small and ready to use: ``zoo:NAME`` is a policy like any other.
+"""Trained agents of Stable-Baselines3, each available as the policy ``zoo:NAME``.
 
-Beside each ``NAME.zip`` stands ``NAME.json``: its environment and options, how it was trained, its
-test numbers, and the SHA-256 of the model. The models are ordinary files of Stable-Baselines3;
-``zoo:NAME`` reads their plain parts and weights alone.
+``NAME.json`` has the environment and its options, the training, the test results and the SHA-256
+of ``NAME.zip``. ``zoo:NAME`` reads the plain parts and the weights of that file only.
 """
 
 import hashlib
@@ -15,16 +14,30 @@ from fusion_gym.validation import ConfigurationError, choice
 
 
 def names() -> list[str]:
-    """Names of the agents."""
+    """Return the sorted names of the agents.
+
+    Example:
+        >>> from fusion_gym import zoo
+        >>> zoo.names()[0]
+        'biased_oscillator_centre'
+    """
     return sorted(Path(str(entry)).stem for entry in _folder().iterdir() if _is_model(entry))
 
 
 def model_path(name: str) -> str:
-    """Path of an agent's model, which is the one that its card describes.
+    """Return the path of an agent's model, whose SHA-256 agrees with its card.
+
+    Args:
+        name: Name of the agent.
 
     Raises:
-        ConfigurationError: no agent of that name (the message lists all), or a file whose SHA-256
-            is not the card's.
+        ConfigurationError: No agent has this name, or the SHA-256 differs from the card.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from fusion_gym import zoo
+        >>> Path(zoo.model_path("tobit_oscillator_local")).name
+        'tobit_oscillator_local.zip'
     """
     text, path = card(name)["sha256"], _folder().joinpath(f"{name}.zip")
     value = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -37,10 +50,18 @@ def model_path(name: str) -> str:
 
 
 def card(name: str) -> dict[str, Any]:
-    """What an agent's JSON says: environment, options, training, test results.
+    """Return an agent's card: environment, options, training and test results.
+
+    Args:
+        name: Name of the agent.
 
     Raises:
-        ConfigurationError: no agent of that name; the message lists all.
+        ConfigurationError: No agent has this name.
+
+    Example:
+        >>> from fusion_gym import zoo
+        >>> zoo.card("tobit_oscillator_local")["env"]
+        'fusion_gym/TobitOscillator-v1'
     """
     path = _folder().joinpath(f"{choice('zoo', name, names())}.json")
     content: dict[str, Any] = json.loads(path.read_text())
