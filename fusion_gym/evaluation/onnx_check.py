@@ -49,8 +49,7 @@ class Agreement(NamedTuple):
 
 
 class Latency(NamedTuple):
-    """Seconds of one call with one row on one thread: the ``median``, and ``most``, the 99 % point.
-    """
+    """Seconds of one call with one row on one thread: ``median``, and ``most``, the 99 % point."""
 
     median: float
     most: float
