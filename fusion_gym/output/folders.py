@@ -1,4 +1,4 @@
-"""Folders of results: one process at a time, and the inputs that a result was made from."""
+"""Folders of results: a lock for one process, and a check of the inputs of a result."""
 
 import hashlib
 import json
@@ -15,13 +15,17 @@ from fusion_gym.validation import ConfigurationError
 
 @contextmanager
 def alone_in(folder: Path, name: str) -> Iterator[None]:
-    """The folder, made if it is not there, for this process alone; ``name`` is its option.
+    """Lock a folder for this process; the folder is created if it does not exist.
 
-    The lock is the operating system's and ends with the process, however that ends. What killed
-    processes left half-written is removed.
+    The operating system releases the lock at any end of the process. The partial files of killed
+    processes are removed.
+
+    Args:
+        folder: the folder.
+        name: name of its option, for error messages.
 
     Raises:
-        ConfigurationError: another process works in the folder, or it cannot be written.
+        ConfigurationError: another process uses the folder, or it cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -44,18 +48,21 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
 
 
 def fingerprint(inputs: Mapping[str, Any]) -> str:
-    """A hash of plain inputs, the same in every process."""
+    """Return a hash of plain inputs, the same in every process."""
     plain = json.dumps(inputs, sort_keys=True, default=list)
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
 def check_inputs(arguments: Mapping[str, Any], earlier: Any, label: str) -> None:
-    """Whether what is there was made from the inputs that are given now.
+    """Check that an earlier result has the same inputs.
 
-    ``earlier`` are the inputs kept with it, and ``label`` says what it is, for the error.
+    Args:
+        arguments: the inputs now.
+        earlier: the inputs that are stored with the result.
+        label: name of the result, for error messages.
 
     Raises:
-        ConfigurationError: it was not; names the first input that differs, with both values.
+        ConfigurationError: they differ; names the first input that differs, with both values.
     """
     now = _flat(json.loads(json.dumps(arguments, default=list)))
     then = _flat(earlier) if isinstance(earlier, Mapping) else {}
