@@ -1,4 +1,4 @@
-"""Checked YAML: every key is known, and every value is allowed, before anything runs."""
+"""Checked YAML: all keys and values are validated before anything runs."""
 
 import os
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ Share = Annotated[float, pydantic.Field(ge=0, le=1)]
 
 
 class Strict(pydantic.BaseModel):
-    """No unknown keys, no conversions, finite numbers, and nothing changes afterwards."""
+    """A model without unknown keys, conversions, infinite numbers and later changes."""
 
     model_config = pydantic.ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False
@@ -37,7 +37,7 @@ class Strict(pydantic.BaseModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _tuples(cls, content: Any) -> Any:
-        """YAML knows lists alone."""
+        """Convert lists to tuples, because YAML has only lists."""
         if not isinstance(content, Mapping):
             return content
         return {
@@ -47,7 +47,11 @@ class Strict(pydantic.BaseModel):
 
 
 def config_path(name: str | Path, option: str = "config") -> Path:
-    """The file of that path, or the shipped config of that name (``tobit_oscillator_ppo``).
+    """Return the file of a path, or the shipped config of a name (``tobit_oscillator_ppo``).
+
+    Args:
+        name: path or name.
+        option: name of the option, for error messages.
 
     Raises:
         ConfigurationError: a bare name that is neither; the message lists the shipped configs.
@@ -60,17 +64,26 @@ def config_path(name: str | Path, option: str = "config") -> Path:
 
 
 def load_checked(kind: type[Model], name: str | Path, option: str = "config") -> Model:
-    """The config of a path or shipped name, checked; ``option`` is where the user named it.
+    """Return the checked config of a path or shipped name.
+
+    Args:
+        kind: class of the config.
+        name: path or name.
+        option: name of the option, for error messages.
 
     Raises:
-        ConfigurationError: unreadable, an unknown key, or a value that is not allowed; names the
-            file and the first such field.
+        ConfigurationError: an unreadable file, an unknown key, or a value that is not allowed;
+            names the file and the first such field.
     """
     return parse(kind, read_yaml(name, option), str(name), option)
 
 
 def read_yaml(name: str | Path, option: str = "config") -> Any:
-    """What the config of a path or shipped name holds.
+    """Return the content of the config of a path or shipped name.
+
+    Args:
+        name: path or name.
+        option: name of the option, for error messages.
 
     Raises:
         ConfigurationError: no such file, or no YAML.
@@ -80,20 +93,31 @@ def read_yaml(name: str | Path, option: str = "config") -> Any:
 
 
 def parse(kind: type[Model], content: Any, source: str, option: str = "config") -> Model:
-    """The content as a checked model.
+    """Return the content as a checked model.
+
+    Args:
+        kind: class of the config.
+        content: the content.
+        source: name of the content in error messages.
+        option: name of the option, for error messages.
 
     Raises:
-        ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and
-            the first such field.
+        ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and the
+            first such field.
     """
     return checked(kind, content, f"{option} {source!r}")
 
 
 def checked(shape: type[Shape], content: Any, source: str) -> Shape:
-    """The content as what ``shape`` says.
+    """Return the content as an object of a type.
+
+    Args:
+        shape: the type.
+        content: the content.
+        source: name of the content in error messages.
 
     Raises:
-        ConfigurationError: an unknown key, or a value that is not allowed; names ``source`` and the
+        ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and the
             first such field.
     """
     try:

@@ -1,4 +1,4 @@
-"""The environment that a command is about, from ``--env``, ``--set`` and ``--config``."""
+"""The environment of a command, from ``--env``, ``--set`` and ``--config``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ if TYPE_CHECKING:
 def environment_of(
     env: str | None, config: str | None, settings: tuple[tuple[str, ...], ...]
 ) -> tuple[str, dict[str, Any], Experiment | None]:
-    """Id, options and training: what ``settings`` say goes before the training's own options.
+    """Return id, options and training of a command line.
+
+    Args:
+        env: id of an environment; it overrides the config.
+        config: path or name of a config.
+        settings: options as words; they override the options of the config.
 
     Raises:
         ConfigurationError: neither an id nor a config, or a config that is not allowed.
@@ -25,7 +30,7 @@ def environment_of(
         if env is None:
             raise ConfigurationError("env = None is not allowed: give --env ID or --config FILE")
         return env, options, None
-    # Here, for it needs Stable-Baselines3, which takes seconds to load.
+    # Imported here, because Stable-Baselines3 takes seconds to load.
     from fusion_gym.training.checked import load_checked
     from fusion_gym.training.config import Experiment
 
