@@ -54,7 +54,7 @@ def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]
         The points of the hull, by rising rate and strictly falling error.
 
     Raises:
-        ConfigurationError: there are no policies.
+        ConfigurationError: no policies.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
@@ -75,7 +75,7 @@ def lower_hull(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
         points: the points; at least one.
 
     Raises:
-        ConfigurationError: there are no points.
+        ConfigurationError: no points.
     """
     ordered = sorted(points, key=lambda point: (point.rate, point.mse, point.name))
     if not ordered:

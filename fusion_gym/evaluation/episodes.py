@@ -14,7 +14,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import orthonormalise
 from fusion_gym.policies.base import Policy, owner_of, refused_signals
 
-BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
+BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on the machine
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ class Rule:
 
     @property
     def stateless(self) -> bool:
-        """Whether the rule has no variables, that is no :meth:`reset` of its own."""
+        """Whether the rule has no variables, which means no :meth:`reset` of its class."""
         return type(self).reset is Rule.reset
 
     def column(self, name: str, sensors: int) -> Array:

@@ -71,7 +71,7 @@ class ModelView:
 
     Args:
         observation_names: names of the entries; None if the file has none.
-        local: whether every sensor runs the model on its own view.
+        local: whether every sensor runs the model on its local view.
         price_range: range of the price of a token; None for a fixed price.
         nominal_error: scale of the entries of beliefs (n,); None for none.
     """
@@ -135,7 +135,7 @@ class Blueprint:
 
         Raises:
             ConfigurationError: a card of a later format, or with entries that are not allowed.
-            NeedsTrust: a policy that is none of :data:`POLICIES`, or needs its own code.
+            NeedsTrust: a policy outside :data:`POLICIES`, or with code in the file.
         """
         card_entry = _entry(data)
         if "format" not in card_entry:

@@ -130,7 +130,7 @@ def _unpickled(
     for name in _candidates(data):
         try:
             model = ALGORITHMS[name].load(file, device="cpu")
-        except Exception as error:  # whatever the file's own code raises
+        except Exception as error:  # the file's code may raise any error
             problems.append(f"{name}: {error}")
             continue
         shape = model.observation_space.shape or ()

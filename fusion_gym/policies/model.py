@@ -23,7 +23,7 @@ def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
     Args:
         model: the model; a subclass of one of the ``ALGORITHMS`` counts as that algorithm.
         task: the task of its training.
-        local: whether every sensor runs the model on its own view.
+        local: whether every sensor runs the model on its local view.
     """
     setattr(model, ENTRY, model_card(algorithm_name(model), model, task, local))
 

@@ -159,8 +159,8 @@ def steady_traces(system: System[Any], schedules: Patterns) -> Array:
 
     The system runs without noise, one run per schedule, since its covariances do not depend on the
     data. A cycle is the common period of schedules and sampling. The mean is over the first cycle
-    that differs by less than a relative 1e-9 from the cycle before it in all runs, or over the
-    cycle with step 1,000. The latter is no steady state where the plant or a node never settles.
+    that differs in all runs by less than a relative 1e-9 from the cycle before. After 1,000 steps
+    it is over the last cycle, which is no steady state where the plant or a node never settles.
 
     Args:
         system: declares a ``covariance_cycle``.

@@ -37,7 +37,7 @@ class Rollout:
     x* the best estimate at that step. If x* is the conditional mean, the cost is the expected
     squared error minus a part that no decision changes.
 
-    With infinite ``samples`` and ``steps`` and a true model, it would cost no more than its base.
+    With infinite ``samples`` and ``steps`` and a true model, its cost is at most the base's cost.
     One step takes samples · (steps + 1) · (sensors + 1) steps of the base.
 
     Args:

@@ -33,17 +33,17 @@ def lagrangian_bound(
 ) -> DualBound:
     """Return a lower bound of the cost of policies that spend at most ``rate`` tokens per step.
 
-    For every multiplier μ >= 0 the sum of the sources' optima at the prices price + μ · spent,
-    minus μ times the supply of tokens, is a lower bound (weak duality). The function returns the
-    largest of these bounds. One transmission per step (``access="single"``) is a rate of 1 with
-    ``spent`` of 1.
+    A multiplier μ >= 0 gives the lower bound Σᵢ Jᵢ(priceᵢ + μ · spentᵢ) - μ · supply by weak
+    duality, where Jᵢ is the optimal cost of source i at a price. The function returns the largest
+    of these bounds. One transmission per step (``access="single"``) is a rate of 1 with ``spent``
+    of 1.
 
-    Without ``horizon`` the cost is the average per step. With it the cost is the sum over an
-    episode, whose channels start in the problems' ``initial`` laws and which receives ``rate``
-    tokens after every step but the last.
+    Without ``horizon`` the cost is the average per step, and the supply is ``rate``. With
+    ``horizon`` the cost is the sum over an episode, whose channels start in the problems'
+    ``initial`` laws. Its supply is ``initial_tokens`` + ``rate`` · (``horizon`` - 1).
 
     Args:
-        problems: the sources, with unlimited tokens of their own.
+        problems: the sources; their own tokens must be unlimited.
         spent: tokens of a transmission of each source.
         rate: tokens per step.
         horizon: number of steps; None for the average cost.

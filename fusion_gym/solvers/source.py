@@ -136,15 +136,14 @@ class SourceProblem:
     ) -> ErrorGrid:
         """Return a grid of errors.
 
-        The default grid has about 600 points (300 with limited tokens), with 5 to 40 points per
-        standard deviation of the noise, and covers all errors up to a probability of 1e-10.
+        The default grid has about 600 points (300 with limited tokens), and 5 to 40 points per
+        standard deviation of the noise. It covers all errors up to a probability of 1e-10.
 
         Args:
             horizon: number of steps; None for no end.
             reach: largest error.
             step: distance of the points.
-            wait: steps between two transmissions; other than ``wait`` for sources that share a
-                network.
+            wait: steps between two transmissions; the source's ``wait`` by default.
             resolution: resolution of the default grid.
         """
         if resolution is None:

@@ -16,7 +16,7 @@ from fusion_gym.training.checked import Positive, Share, Strict, parse
 class EnvironmentConfig(Strict):
     """A registered environment and its options of ``gym.make``.
 
-    ``local`` trains one policy that every sensor runs on its own view. If the option ``system``
+    ``local`` trains one policy that every sensor runs on its local view. If the option ``system``
     names a file of options, the config includes its content.
     """
 
@@ -33,10 +33,10 @@ class EnvironmentConfig(Strict):
 class TrainingConfig(Strict):
     """Length, number of runs, seed and threads of a training.
 
-    With a drawn price and ``price_exponent``, an episode has the weight (middle of the range /
-    price)^exponent in training and validation, so that the agent does not neglect low prices. With
-    more sensors than ``many_sensors``, ``timesteps`` falls in proportion, because a step takes
-    longer.
+    If the price is drawn, an episode has the weight (middle of the range /
+    price)^``price_exponent`` in training and validation. A positive exponent raises the weight of
+    low prices. With more sensors than ``many_sensors``, ``timesteps`` falls in proportion, because
+    a step takes longer.
 
     ``error`` is the trained error; validations use the true error. ``excess`` and ``mismatch``
     subtract the part that no policy can change, by an estimate from every measurement.

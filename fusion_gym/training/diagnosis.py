@@ -54,7 +54,7 @@ def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[st
     """Return rate and MSE of the episodes in each non-empty part of the range of prices.
 
     Each part has the ends ``low`` and ``high`` of its prices, its number of ``episodes``, their
-    ``rate`` per sensor and step, and their ``mse``. For a fixed price there are no parts.
+    ``rate`` per sensor and step, and their ``mse``. The list is empty for a fixed price.
 
     Args:
         task: the task.

@@ -33,7 +33,7 @@ class CentreVariance(Rule):
         The rule requests the last of these sets. P_S is the fused covariance of this step after the
         packets of S, θ is ``threshold``; at most ``at_most`` sensors are added.
 
-    Assumes: claimed covariances that are true, whatever the measurements.
+    Assumes: claimed covariances that are true.
 
     Source: the threshold is from S. Trimpe and R. D'Andrea, "Event-based state estimation with
     variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the greedy choice is from

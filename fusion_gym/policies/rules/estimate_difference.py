@@ -22,7 +22,7 @@ class EstimateDifference(BeliefRule):
     the sensor's own measurement.
 
     Args:
-        own: every sensor decides locally, by its memory and what it receives.
+        own: every sensor decides locally, by its memory and the broadcasts.
         threshold: θ >= 0, in the unit of the states, or without a unit.
         whitened: weigh by the inverse of the centre's claimed covariance.
         at_most: most requests in a step, by the highest value; None for no limit.

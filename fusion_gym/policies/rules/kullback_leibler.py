@@ -22,7 +22,7 @@ class KullbackLeibler(BeliefRule):
     memory, replaces x̂(s). D counts a reduction of the variance even if the mean does not change.
 
     Args:
-        own: every sensor decides locally, by its memory and what it receives.
+        own: every sensor decides locally, by its memory and the broadcasts.
         threshold: θ >= 0, in nats.
         at_most: most requests in a step, by the highest divergence; None for no limit.
 

@@ -51,7 +51,7 @@ class PricedThreshold(BeliefRule):
     once, instead of one threshold for each price.
 
     Args:
-        own: every sensor decides locally, by its memory and what it receives.
+        own: every sensor decides locally, by its memory and the broadcasts.
         score: v and l. ``"value"``: the expected value of a packet and the squared norm of x* - x̂
             (:mod:`fusion_gym.core.beliefs`). ``"innovation"``: the squared norm of the innovation,
             v in predicted standard deviations, l in the unit of the measurement. ``"variance"``:
@@ -81,10 +81,10 @@ class PricedThreshold(BeliefRule):
         $$
 
         vᵢ and l are the ``score``, p is the price of a token, b the tokens and b̄ their capacity
-        (the ratio is 1 where tokens are unlimited), aᵢ the steps since the last delivery, kᵢ the
-        number of sensors with a larger r in this step. θ is ``threshold``, β ``price_exponent``, p₀
-        ``reference_price``, m ``mixture``, κ ``token_exponent``, α ``age_exponent``, s ``margin``,
-        μ ``margin_exponent``.
+        (the ratio is 1 where tokens are unlimited). aᵢ are the steps since the last delivery, kᵢ is
+        the number of sensors with a larger r in this step. θ is ``threshold``, β
+        ``price_exponent``, p₀ ``reference_price``, m ``mixture``, κ ``token_exponent``, α
+        ``age_exponent``, s ``margin``, μ ``margin_exponent``.
 
     Assumes: the assumptions of the rule of its score, ``value_of_information``,
     ``innovation_threshold`` or ``variance_threshold``; numbers that were searched for this task.

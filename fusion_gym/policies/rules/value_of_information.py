@@ -28,7 +28,7 @@ class ValueOfInformation(BeliefRule):
     most settings this is the strongest rule, above all with memory.
 
     Args:
-        own: every sensor decides locally, by its memory and what it receives.
+        own: every sensor decides locally, by its memory and the broadcasts.
         threshold: θ >= 0, in squared units of the states; 0.03 without a price.
         price: price of a token in the reward's units, instead of the threshold.
         at_most: most requests in a step, by the highest value; None for no limit.

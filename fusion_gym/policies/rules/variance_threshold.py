@@ -30,7 +30,7 @@ class VarianceThreshold(Rule):
         of sensor i only, W the reward's weights of the states, θ ``threshold``; ``at_most`` sensors
         are requested.
 
-    Assumes: claimed covariances that are true, whatever the measurements.
+    Assumes: claimed covariances that are true.
 
     Source: after S. Trimpe and R. D'Andrea, "Event-based state estimation with variance-based
     triggering", IEEE Trans. Automatic Control 59, 2014.

@@ -14,8 +14,8 @@ class Survival:
     Silence at time t needs e(t) in an ellipsoid {|F e| <= 1}. Among Gaussians of one covariance,
     the one of mean 0 gives a convex symmetric set its largest probability (T. W. Anderson, "The
     integral of a symmetric unimodal function", 1955). Hence, for any e(t), the probability of
-    silence at t + 1, …, t + j is at most ρ(j), the least product of such probabilities over any
-    choice of times in between.
+    silence at t + 1, …, t + j is at most ρ(j). ρ(j) is the least product of such probabilities over
+    any choice of times in between.
 
     ``curvature`` (n, n) is S(t) = Σ ρ(j) (Aʲ)ᵀ W Aʲ over j >= 0, for the last added time t.
     """
