@@ -36,14 +36,7 @@ def main() -> None:
 
 
 def load(name: str) -> Any:
-    """Return the class of a command.
-
-    Args:
-        name: name of the command.
-
-    Raises:
-        SystemExit: an unknown command (2), or a missing package (1).
-    """
+    """Return the class of a command."""
     try:
         module = importlib.import_module(f"fusion_gym.commands.{choice('command', name, COMMANDS)}")
         return getattr(module, name.capitalize())

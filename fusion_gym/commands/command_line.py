@@ -130,15 +130,7 @@ def _optional(
 
 
 def read_command(kind: type[_Kind]) -> _Kind:
-    """Return the command with the options of the command line.
-
-    Args:
-        kind: class of the command.
-
-    Raises:
-        SystemExit: after the help (status 0), or after one line about a wrong option (2).
-        ConfigurationError: a word is empty, or no text.
-    """
+    """Return the command with the options of the command line."""
     _check_words()
     output = io.StringIO()
     try:

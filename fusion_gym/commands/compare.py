@@ -81,16 +81,7 @@ class Compare(Long):
         compare(world.id, task, sweep, baselines, requested, self.seed, self.output)
 
     def policies_of(self, task: Task) -> dict[str, float]:
-        """Return the policy, or the policy at each of the prices, with the price of a token.
-
-        For a drawn price it is the middle of the range.
-
-        Args:
-            task: the task.
-
-        Raises:
-            ConfigurationError: ``prices`` without a drawn price, or for a policy without a price.
-        """
+        """Return the policy, or the policy at each price, with the price of a token."""
         if self.prices is None:
             return {self.policy: float(task.reward.price.draw(np.array([0.5]))[0])}
         span = task.reward.price.span
@@ -127,20 +118,7 @@ def compare(
     env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
     agents: Mapping[str, float], seed: int, folder: Path,
 ) -> None:  # fmt: skip
-    """Run the agent on the baselines' episodes, and write, print and draw the comparison.
-
-    Args:
-        env_id: id of the environment.
-        task: the task.
-        sweep: the sweep of the baselines.
-        baselines: results of the baselines by name.
-        agents: price of a token for each text of the agent.
-        seed: seed of the first episode.
-        folder: folder for the results.
-
-    Raises:
-        ConfigurationError: the agent transmits less than every baseline.
-    """
+    """Run the agent on the baselines' episodes, and write, print and draw the comparison."""
     episodes = next(iter(baselines.values())).episodes
     learned = run_all(task, list(agents), episodes, seed, "agent")
     points = []

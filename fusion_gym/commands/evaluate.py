@@ -93,14 +93,7 @@ class Evaluate(EnvironmentOptions, Long):
 
 
 def evaluate(command: Evaluate) -> dict[str, Any]:
-    """Run the evaluation of a command line and return its JSON.
-
-    Args:
-        command: the options of the command line.
-
-    Raises:
-        ConfigurationError: an option that is not allowed, before the first episode.
-    """
+    """Run the evaluation of a command line and return its JSON."""
     env_id, options, _ = environment_of(command.env, command.config, command.options)
     task = make_task(env_id, **options)
     names = list(dict.fromkeys(chain(*command.policies)))
@@ -186,15 +179,7 @@ def evaluation_report(
 
 
 def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
-    """Return the JSON of an earlier run of the same evaluation.
-
-    Args:
-        path: the file.
-        report: the JSON of this evaluation.
-
-    Raises:
-        ConfigurationError: no file, or a file without an evaluation, or with another one.
-    """
+    """Return the JSON of an earlier run of the same evaluation."""
     if path is None:
         raise ConfigurationError("resume = True is not allowed without json: there is no file")
     if not path.exists():

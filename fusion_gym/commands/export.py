@@ -49,15 +49,7 @@ class Export(EnvironmentOptions, Command):
 
 
 def export(command: Export) -> list[str]:
-    """Write the file and return its description in lines.
-
-    Args:
-        command: the options of the command line.
-
-    Raises:
-        ConfigurationError: an option that is not allowed, or a graph that decides otherwise than
-            the agent; then no file is written.
-    """
+    """Write the file and return its description in lines; a wrong graph leaves no file."""
     kind, _, rest = spec(command.model).partition(":")
     env_id, options = _environment(command, kind, rest.partition(",")[0])
     require("onnx", "onnx", "onnx", "onnxruntime")
@@ -86,14 +78,7 @@ def export(command: Export) -> list[str]:
 
 
 def spec(text: str) -> str:
-    """Return the agent as a policy's text, with ``model:`` before a bare path.
-
-    Args:
-        text: the agent.
-
-    Raises:
-        ConfigurationError: a policy that is no saved agent.
-    """
+    """Return the agent as a policy's text, with ``model:`` before a bare path."""
     kind, colon, _ = text.partition(":")
     if colon and kind in _KINDS:
         return text

@@ -25,15 +25,7 @@ class Mark(ABC):
 
     @abstractmethod
     def check(self, option: str, value: Any) -> None:
-        """Check one value.
-
-        Args:
-            option: name of the option.
-            value: the value.
-
-        Raises:
-            ConfigurationError: the value is not allowed.
-        """
+        """Check one value."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +84,7 @@ TrainingSeed = Annotated[int | None, _TRAINING]
 
 
 def check_options(values: Any) -> None:
-    """Check every field of a command by its marks.
-
-    Args:
-        values: the command.
-
-    Raises:
-        ConfigurationError: the first field that is not allowed.
-    """
+    """Check every field of a command by its marks."""
     hints = typing.get_type_hints(type(values), include_extras=True)
     for field in fields(values):
         value = getattr(values, field.name)
@@ -121,32 +106,12 @@ def _refuse_input(values: Any, option: str, path: Path) -> None:
 
 
 def writable_folder(option: str, folder: Path) -> None:
-    """Check that files can be written into a folder, which need not exist.
-
-    The check leaves neither the folder nor a file.
-
-    Args:
-        option: name of the option.
-        folder: the folder.
-
-    Raises:
-        ConfigurationError: they cannot.
-    """
+    """Check, without a trace, that files can be written into a folder, which need not exist."""
     _try_out(option, folder, "a folder that can be written", lambda: _write_in(folder))
 
 
 def writable_file(option: str, file: Path) -> None:
-    """Check that a file can be replaced or created; neither it nor its folder need exist.
-
-    The check leaves no file and does not change an existing one.
-
-    Args:
-        option: name of the option.
-        file: the file.
-
-    Raises:
-        ConfigurationError: it cannot.
-    """
+    """Check, without a trace, that a file can be replaced or created."""
 
     def write() -> None:
         if file.is_dir():

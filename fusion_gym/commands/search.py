@@ -75,15 +75,7 @@ class Search(EnvironmentOptions, Long):
         tables.console().print(result_table(env_id, result))
 
     def rule_search(self, env_id: str, options: dict[str, Any]) -> RuleSearch:
-        """Return the search of the class in this environment.
-
-        Args:
-            env_id: id of the environment.
-            options: options of the environment.
-
-        Raises:
-            ConfigurationError: an option that is not allowed, or a class without such a rule.
-        """
+        """Return the search of the class in this environment."""
         task = make_task(env_id, **options)
         prices = token_prices(env_id, options, task, self.prices)
         result = search_of_class(self.of, task, prices, generations=self.generations)
@@ -111,15 +103,7 @@ class Search(EnvironmentOptions, Long):
             return search_rule(search, tuple(generations), progress)
 
     def earlier(self, inputs: dict[str, Any]) -> list[Generation]:
-        """Return the generations in the folder, of the same search.
-
-        Args:
-            inputs: inputs of the search.
-
-        Raises:
-            ConfigurationError: the folder contains a search and ``resume`` is false, there is
-                nothing to resume, or the search has other inputs.
-        """
+        """Return the generations in the folder, of the same search."""
         path, place = self.output / _GENERATIONS, f"output = {str(self.output)!r}"
         if not self.resume:
             if path.exists() or (self.output / _RESULT).exists():
@@ -145,17 +129,7 @@ class Search(EnvironmentOptions, Long):
 
 
 def token_prices(env_id: str, options: dict[str, Any], task: Task, count: int) -> tuple[float, ...]:
-    """Return prices at even logarithmic distances over the task's price_range, or over "auto".
-
-    Args:
-        env_id: id of the environment.
-        options: options of the environment.
-        task: the task.
-        count: number of prices.
-
-    Raises:
-        ConfigurationError: a plant without such prices.
-    """
+    """Return prices at even logarithmic distances over the task's price_range, or over "auto"."""
     span = task.reward.price.span
     if span is None:
         drawn = {"price_range": "auto", "cost_weight": "random"}

@@ -95,15 +95,7 @@ def worst(terms: Mapping[str, CrossTerm]) -> tuple[str, CrossTerm]:
 
 
 def usual_policies(task: Task, rate: float) -> list[str]:
-    """Return the texts of two policies that exist in every environment.
-
-    The first requests at random at ``rate``. The second is ``value_of_information`` at the price of
-    a token (the middle of its range), or ``always`` where a policy may not use new measurements.
-
-    Args:
-        task: the task.
-        rate: rate of the random requests.
-    """
+    """Return the texts of two policies that exist in every environment."""
     random = f"random:rate={rate:.4g}"
     if task.information != "sensors":
         return [random, "always"]

@@ -69,14 +69,7 @@ def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]
 
 
 def lower_hull(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
-    """Return the lower convex hull of points in any order.
-
-    Args:
-        points: the points; at least one.
-
-    Raises:
-        ConfigurationError: no points.
-    """
+    """Return the lower convex hull of points in any order."""
     ordered = sorted(points, key=lambda point: (point.rate, point.mse, point.name))
     if not ordered:
         raise ConfigurationError("policies = {} is not allowed: an envelope needs at least one")
@@ -97,17 +90,7 @@ def _above(left: EnvelopePoint, middle: EnvelopePoint, right: EnvelopePoint) -> 
 
 
 def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | None:
-    """Return the policies of an envelope at a rate, by rising rate, with their shares.
-
-    To the right of the envelope its last policy has the share 1.
-
-    Args:
-        hull: points of the envelope, by rising rate.
-        rate: transmissions per sensor and step.
-
-    Returns:
-        The shares by name; ``None`` to the left of the envelope.
-    """
+    """Return the shares of policies of an envelope at a rate; ``None`` to the left of it."""
     if rate < hull[0].rate:
         return None
     left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)

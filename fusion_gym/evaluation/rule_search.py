@@ -231,18 +231,7 @@ def search_of_class(
 def try_thresholds(
     task: Task, template: str, values: Sequence[float], episodes: int, seed: int
 ) -> list[ThresholdTrial]:
-    """Run a rule with each of several thresholds in one batch.
-
-    Args:
-        task: the task.
-        template: text of the rule, with ``{value}`` in the place of the threshold.
-        values: the thresholds.
-        episodes: episodes of each threshold.
-        seed: seed of the first episode.
-
-    Raises:
-        ConfigurationError: no ``{value}`` in the template, or an unknown policy.
-    """
+    """Run a rule with each of several thresholds, ``{value}`` in the template, in one batch."""
     if "{value}" not in template:
         raise validation.refusal("template", template, "a policy with {value} for its threshold")
     texts = [template.replace("{value}", f"{value:.5g}") for value in values]
@@ -282,15 +271,7 @@ def search_rule(
 
 
 def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> Iterator[Generation]:
-    """Yield the generations of a search after the earlier ones.
-
-    Args:
-        search: the search.
-        earlier: generations of an interrupted search.
-
-    Raises:
-        ConfigurationError: the package cmaes is missing, or ``earlier`` belongs to another search.
-    """
+    """Yield the generations of a search after the earlier ones."""
     require("a search of a rule", "agents", "cmaes")
     from cmaes import CMA
 
@@ -320,15 +301,7 @@ def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> I
 
 
 def search_result(search: RuleSearch, generations: Sequence[Generation]) -> SearchResult:
-    """Measure the mean of the second half of the generations' means on fresh episodes.
-
-    Args:
-        search: the search.
-        generations: its generations; at least one.
-
-    Raises:
-        ConfigurationError: no generations.
-    """
+    """Measure the mean of the second half of the generations' means on fresh episodes."""
     if not generations:
         raise validation.refusal("generations", generations, "one or more")
     mean = np.mean([item.mean for item in generations[len(generations) // 2 :]], axis=0)

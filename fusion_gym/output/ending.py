@@ -25,15 +25,11 @@ _COMMANDS = ("agents.", *(f"fusion_gym.{name}." for name in ("commands", "output
 def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[None]:
     """End the program with one line after an error of the user or the machine.
 
-    An error in a user's code ends with its file and line. Any other error is an error of the
-    program and keeps its traceback.
+    An error in a user's code ends with its file and line. Any other error keeps its traceback. The
+    exit status is 1, after an interrupt 130, and after a closed output 141.
 
     Args:
         interrupted: function that returns the line after an interrupt.
-
-    Raises:
-        SystemExit: an option, file or amount of memory that is refused (status 1), an interrupt
-            (130), or a closed output (141, without a line).
     """
     try:
         _write_anything()

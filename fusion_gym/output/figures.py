@@ -29,16 +29,7 @@ def pareto(
     agent: FigureLine,
     envelope: Sequence[EnvelopePoint],
 ) -> None:
-    """Draw MSE against transmission rate, with 95 % intervals over episodes.
-
-    Args:
-        path: the file.
-        title: title of the figure.
-        lines: the swept baselines.
-        points: results of single policies by name.
-        agent: the agent at each of its prices.
-        envelope: lower convex hull of the baselines.
-    """
+    """Draw MSE against transmission rate, with 95 % intervals over episodes."""
     figure, axes = plt.subplots(figsize=(8.6, 5.6))
     colours = plt.get_cmap("tab20")
     for place, line in enumerate(lines):

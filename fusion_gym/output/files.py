@@ -53,13 +53,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove the partial files of killed processes; no other process may write in the folder.
-
-    In subfolders only partial tables, JSON files and episodes are removed.
-
-    Args:
-        folder: the folder.
-    """
+    """Remove the partial files of killed processes; no other process may write in the folder."""
     for partial in (*folder.glob("*"), *folder.glob("*/*.part.[cjn]*")):
         if _PARTIAL.search(partial.name):
             partial.unlink(missing_ok=True)
@@ -78,15 +72,7 @@ def write(path: Path | None, report: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path, name: str) -> dict[str, Any]:
-    """Return the object in a JSON file.
-
-    Args:
-        path: the file.
-        name: name of the file in error messages.
-
-    Raises:
-        ConfigurationError: the file cannot be read, or contains no JSON object.
-    """
+    """Return the object in a JSON file; ``name`` is the file's name in error messages."""
     text = read_text(name, path)
     try:
         content = json.loads(text)

@@ -14,14 +14,7 @@ ENDINGS = (".gif", ".mp4")
 
 
 def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:
-    """Write frames as a film; the file appears after the last frame.
-
-    Args:
-        frames: pictures (height, width, 3) with even height and width, as the codec of MP4
-            requires.
-        path: the file, ``.gif`` or ``.mp4``.
-        fps: frames per second.
-    """
+    """Write frames of even height and width as a film; the file appears after the last frame."""
     import imageio.v2 as imageio
 
     writer: Any

@@ -15,18 +15,7 @@ from fusion_gym.validation import ConfigurationError
 
 @contextmanager
 def alone_in(folder: Path, name: str) -> Iterator[None]:
-    """Lock a folder for this process; the folder is created if it does not exist.
-
-    The operating system releases the lock at any end of the process. The partial files of killed
-    processes are removed.
-
-    Args:
-        folder: the folder.
-        name: name of its option, for error messages.
-
-    Raises:
-        ConfigurationError: another process uses the folder, or it cannot be written.
-    """
+    """Lock a folder for this process, create it if needed, and remove old partial files."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".lock")
@@ -54,16 +43,7 @@ def fingerprint(inputs: Mapping[str, Any]) -> str:
 
 
 def check_inputs(arguments: Mapping[str, Any], earlier: Any, label: str) -> None:
-    """Check that an earlier result has the same inputs.
-
-    Args:
-        arguments: the inputs now.
-        earlier: the inputs that are stored with the result.
-        label: name of the result, for error messages.
-
-    Raises:
-        ConfigurationError: they differ; names the first input that differs, with both values.
-    """
+    """Check that an earlier result has the same inputs; an error names the first difference."""
     now = _flat(json.loads(json.dumps(arguments, default=list)))
     then = _flat(earlier) if isinstance(earlier, Mapping) else {}
     if not then:
@@ -85,7 +65,7 @@ _ABSENT = _Absent()
 
 
 def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested values by their dotted names."""
+    """Return nested values by their dotted names."""
     result: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and value:

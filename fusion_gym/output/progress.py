@@ -109,15 +109,7 @@ class Bar:
 def progress_bar(
     total: float, description: str, initial: float = 0.0, quiet: bool = False, unit: str = "steps"
 ) -> Iterator[Bar]:
-    """Show a bar inside the context, below the bars of outer contexts.
-
-    Args:
-        total: total amount of work.
-        description: name of the work.
-        initial: amount that was done before.
-        quiet: whether nothing is shown.
-        unit: unit of the amounts, in the plural.
-    """
+    """Show a bar inside the context, below the bars of outer contexts."""
     bar = Bar(description, total, unit, initial)
     silent = quiet or is_quiet()
     drawn = not silent and (_SCREEN.progress is not None or _watched())

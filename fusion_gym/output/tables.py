@@ -52,14 +52,7 @@ def evaluation_table(
     quantiles: Mapping[str, Mapping[str, float]],
     differences: Mapping[str, Interval],
 ) -> Table:
-    """Return the table of an evaluation, with one row per policy.
-
-    Args:
-        title: title of the table.
-        policies: metrics of each policy.
-        quantiles: quantiles of each policy.
-        differences: differences to a reference; may be empty.
-    """
+    """Return the table of an evaluation, with one row per policy."""
     metrics = {name: metric for name, metric in METRICS.items() if metric.column}
     columns = ["policy", *(metric.column for metric in metrics.values()), "median"]
     columns += ["MSE - reference"] if differences else []

@@ -36,15 +36,7 @@ class NeedsTrust(ConfigurationError):
 
 
 def read_plain(file: Path) -> dict[str, Any]:
-    """Return the archive's ``data``, with pickled entries as text.
-
-    Args:
-        file: the archive.
-
-    Raises:
-        ConfigurationError: no archive, or no plain JSON in it.
-        NeedsTrust: a part larger than ``LARGEST``.
-    """
+    """Return the archive's ``data``, with pickled entries as text."""
     content = _part(file, "data")
     try:
         data = json.loads(content)
@@ -56,15 +48,7 @@ def read_plain(file: Path) -> dict[str, Any]:
 
 
 def read_weights(file: Path) -> dict[str, torch.Tensor]:
-    """Return the policy's weights by name, finite float32.
-
-    Args:
-        file: the archive.
-
-    Raises:
-        ConfigurationError: no archive, or no weights in it.
-        NeedsTrust: anything but plain weights, or weights larger than ``LARGEST``.
-    """
+    """Return the policy's weights by name, finite float32."""
     content = io.BytesIO(_part(file, "policy.pth"))
     try:
         with zipfile.ZipFile(content) as parts:

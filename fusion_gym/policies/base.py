@@ -122,15 +122,7 @@ class Rule:
         return type(self).reset is Rule.reset
 
     def column(self, name: str, sensors: int) -> Array:
-        """Return a parameter as (sensors, 1), from one number for all sensors or one for each.
-
-        Args:
-            name: name of the parameter.
-            sensors: number of sensors.
-
-        Raises:
-            ConfigurationError: another number of entries.
-        """
+        """Return a parameter as (sensors, 1), from one number for all sensors or one for each."""
         return validation.spread(name, getattr(self, name), (sensors,))[:, None]
 
     def reset(self, runs: int, seed: int = 0) -> None:

@@ -47,17 +47,7 @@ def knows(task: Task, own: bool) -> Knowledge:
 
 
 def check_owner(task: Task, own: bool, **only_together: Any) -> None:
-    """Check that a task shows the measurements, and with ``own`` that sensors can decide locally.
-
-    Args:
-        task: the task.
-        own: whether every sensor decides locally.
-        **only_together: parameters that compare sensors; with ``own`` they must be ``None``, 0 or
-            1.
-
-    Raises:
-        ConfigurationError: the task does not, or such a parameter together with ``own``.
-    """
+    """Check that a task shows the measurements, and with ``own`` allows local decisions."""
     if task.information != "sensors":
         raise ConfigurationError(
             f"information = {task.information!r} is not allowed with this rule: it must be "

@@ -97,14 +97,7 @@ class ModelView:
         )
 
     def on(self, task: Task) -> Task:
-        """Return the task with the price and the scale of the model's training.
-
-        Args:
-            task: the task.
-
-        Raises:
-            ConfigurationError: the model has no scale, or a scale for another number of states.
-        """
+        """Return the task with the price and the scale of the model's training."""
         if self.price_range is not None and task.reward.price.span is None:
             price = Price(None, self.price_range)
             task = replace(task, reward=replace(task.reward, price=price))
@@ -128,15 +121,7 @@ class Blueprint:
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> Blueprint:
-        """Return the blueprint of the card, or of the readable entries of Stable-Baselines3.
-
-        Args:
-            data: the archive's data.
-
-        Raises:
-            ConfigurationError: a card of a later format, or with entries that are not allowed.
-            NeedsTrust: a policy outside :data:`POLICIES`, or with code in the file.
-        """
+        """Return the blueprint of the card, or of the readable entries of Stable-Baselines3."""
         card_entry = _entry(data)
         if "format" not in card_entry:
             return _inferred(data)
@@ -188,13 +173,7 @@ def algorithm_name(model: BaseAlgorithm) -> str:
 
 
 def algorithm_of(data: Mapping[str, Any]) -> str | None:
-    """Return the algorithm of the card, or of the policy class in the archive's plain entries.
-
-    A2C and PPO have the same policy class; without a ``clip_range`` the algorithm is A2C.
-
-    Args:
-        data: the archive's data.
-    """
+    """Return the algorithm of the card, or of the policy class in the archive's plain entries."""
     card_entry = _entry(data).get("algorithm")
     if isinstance(card_entry, str):
         return card_entry

@@ -18,13 +18,7 @@ from fusion_gym.validation import ConfigurationError
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
-    """Write the model's card (:mod:`fusion_gym.policies.card`) into the model before it is saved.
-
-    Args:
-        model: the model; a subclass of one of the ``ALGORITHMS`` counts as that algorithm.
-        task: the task of its training.
-        local: whether every sensor runs the model on its local view.
-    """
+    """Write the model's card (:mod:`fusion_gym.policies.card`) into it before it is saved."""
     setattr(model, ENTRY, model_card(algorithm_name(model), model, task, local))
 
 

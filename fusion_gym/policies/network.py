@@ -32,17 +32,7 @@ class NetworkShape:
 
     @classmethod
     def of(cls, shapes: Shapes) -> NetworkShape:
-        """Return the networks that have weights of these shapes.
-
-        Every size is checked against its neighbours, so the built networks are about as large as
-        the weights.
-
-        Args:
-            shapes: shapes of the weights by name.
-
-        Raises:
-            NeedsTrust: weights of other networks.
-        """
+        """Return the networks that have weights of these shapes, after a check of all sizes."""
         if f"{_VALUES}.0.weight" in shapes:
             *hidden, last = _chain(shapes, _VALUES)
             entries = (hidden or [last])[0][1]

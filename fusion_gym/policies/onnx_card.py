@@ -74,14 +74,7 @@ def onnx_card(
 
 
 def layout_version(environment: str, names: list[str]) -> str:
-    """Return the id of the environment and a hash of the entries' names and order.
-
-    The version number in the id also identifies the scaling.
-
-    Args:
-        environment: id of the environment.
-        names: names of the entries.
-    """
+    """Return the id of the environment and a hash of the entries' names and order."""
     digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     return f"{environment}:{digest[:16]}"
 

@@ -166,16 +166,7 @@ def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
 
 
 def save_graph(graph: DecisionGraph, path: Path, received: Mapping[str, str]) -> None:
-    """Write the graph as an ONNX file, with ``received`` as its metadata.
-
-    Args:
-        graph: the graph.
-        path: the file.
-        received: metadata by name.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the graph as an ONNX file, with ``received`` as its metadata."""
     onnx: Any = importlib.import_module("onnx")
     shapes = {**graph.inputs, **graph.outputs}
     with torch.no_grad(), warnings.catch_warnings():

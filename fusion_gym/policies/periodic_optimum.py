@@ -182,16 +182,7 @@ def steady_traces(system: System[Any], schedules: Patterns) -> Array:
 
 
 def episode_traces(system: System[Any], schedules: Patterns, steps: int) -> Array:
-    """Return traces (N,) as in :func:`steady_traces`, averaged over ``steps`` steps from the start.
-
-    Args:
-        system: declares a ``covariance_cycle``.
-        schedules: (period, sensors, N) bool, row 0 for the first step of an episode.
-        steps: number of steps.
-
-    Raises:
-        ConfigurationError: the system's covariances depend on the data.
-    """
+    """Return traces (N,) as in :func:`steady_traces`, averaged over the first ``steps`` steps."""
     _cycle(system)
     return _Still(system, schedules).total(steps) / steps
 

@@ -47,11 +47,7 @@ class PlanningModel:
         return len(self._tokens)
 
     def grant(self, requests: NDArray[np.bool_]) -> Grants:
-        """Return the network's answer to requests (sensors, N) now.
-
-        Args:
-            requests: requests (sensors, N); at most one per run with ``access="single"``.
-        """
+        """Return the network's answer to requests (sensors, N) now."""
         admitted = requests & self._admitted
         return self._task.bucket.grant(self._tokens, admitted, self._step, self._queue)
 

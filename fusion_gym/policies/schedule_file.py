@@ -21,12 +21,7 @@ _FORMAT = 2
 
 
 class Schedule(NamedTuple):
-    """A schedule and its trace.
-
-    Attributes:
-        requests: requests (period, sensors) bool, row 0 for the first step of an episode.
-        trace: unweighted trace of the covariance of the fused error, averaged over time.
-    """
+    """Requests (period, sensors) bool from the start of an episode, and their mean ``trace``."""
 
     requests: Patterns
     trace: float

@@ -9,13 +9,7 @@ from fusion_gym.validation import ConfigurationError
 
 
 def parse_value(text: str) -> Any:
-    """Return a number, true, false, none, inf or a Python list from its text, or the text.
-
-    Slashes separate values for several sensors: ``0.1/0.2/0.3``.
-
-    Args:
-        text: the text.
-    """
+    """Return the number, keyword, list or ``0.1/0.2/0.3`` of a text, or else the text."""
     plain = {"true": True, "false": False, "none": None, "null": None}
     if text.strip().lower() in plain:
         return plain[text.strip().lower()]
@@ -31,15 +25,7 @@ def parse_value(text: str) -> Any:
 
 
 def parse_settings(kind: str, entries: Iterable[str]) -> dict[str, Any]:
-    """Return ``["key=value", …]`` as a dictionary, with :func:`parse_value`.
-
-    Args:
-        kind: the kind of setting, for error messages.
-        entries: the settings.
-
-    Raises:
-        ConfigurationError: an entry without ``=``, or a key that occurs twice.
-    """
+    """Return ``["key=value", …]`` as a dictionary, with :func:`parse_value`."""
     result: dict[str, Any] = {}
     for entry in entries:
         key, equals, value = entry.partition("=")

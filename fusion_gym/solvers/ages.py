@@ -30,14 +30,7 @@ class AgeSolution:
 
 
 def silent_variances(problem: SourceProblem, longest: int) -> Array:
-    """Return the variances (longest,) of errors of the ages 1 to ``longest``.
-
-    The variance of an error of age k is σ² (1 + a² + … + a^(2(k-1))).
-
-    Args:
-        problem: the source.
-        longest: largest age.
-    """
+    """Return the variances of errors of the ages k = 1, 2, …: σ² (1 + a² + … + a^(2(k-1)))."""
     with np.errstate(over="ignore"):
         powers = problem.coefficient ** (2.0 * np.arange(longest))
     return problem.deviation**2 * np.cumsum(powers)

@@ -36,13 +36,7 @@ class ErrorGrid:
 
 
 def gaussian_rows(mean: Array, deviation: float, points: Array) -> Array:
-    """Return the weights (R, M) of the points of |X|, X ~ N(mean, deviation²); rows sum to 1.
-
-    Args:
-        mean: means (R,).
-        deviation: standard deviation.
-        points: points 0, h, 2h, … (M,).
-    """
+    """Return the weights (R, M) of the points of |X|, X ~ N(mean, deviation²); rows sum to 1."""
     step = points[1]
     scale = step / (deviation * np.sqrt(2.0 * np.pi))
     rows = np.exp(-0.5 * ((points - mean[:, None]) / deviation) ** 2)
@@ -72,21 +66,7 @@ def default_reach(
     horizon: int | None,
     negligible: float,
 ) -> float:
-    """Return an error that is exceeded with a ``negligible`` probability.
-
-    From the threshold on, silence lasts while packets are lost. Within a horizon, no error exceeds
-    the result of silence from the start.
-
-    Args:
-        coefficient: a.
-        deviation: σ.
-        threshold: threshold of a request.
-        transition: transition matrix of the channel (S, S).
-        drop: probability of a loss in each channel state (S,).
-        wait: steps between two packets that the tokens allow.
-        horizon: number of steps; None for no end.
-        negligible: the probability.
-    """
+    """Return an error that is exceeded with a ``negligible`` probability."""
     tails = -float(ndtri(0.5 * negligible))
     persistence = float(np.abs(np.linalg.eigvals(transition * drop)).max())
     losses = np.inf if persistence >= 1.0 else 0.0

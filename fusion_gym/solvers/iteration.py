@@ -18,7 +18,7 @@ def iterate_values(
     iterations: int,
     laziness: float = 0.0,
 ) -> tuple[float, float, ChoiceT]:
-    """Return bounds of the least average cost within ``tolerance``, and the choice.
+    """Return bounds of the least average cost within a relative ``tolerance``, and the choice.
 
     Args:
         decide: function from the values of the next step to the present values and the choice.
@@ -26,9 +26,6 @@ def iterate_values(
         tolerance: largest relative distance of the bounds.
         iterations: largest number of iterations.
         laziness: weight of the old values.
-
-    Raises:
-        ConfigurationError: no convergence.
     """
     value, lower, upper = np.zeros(shape), 0.0, 0.0
     for _ in range(iterations):

@@ -43,16 +43,7 @@ class JointProblem:
         bucket: TokenBucket | None = None,
         at_most: int = 2,
     ) -> JointProblem:
-        """Return the checked problem.
-
-        Args:
-            sources: two sources.
-            bucket: the common bucket; None for unlimited tokens.
-            at_most: largest number of transmissions in a step.
-
-        Raises:
-            ConfigurationError: not two sources, or more than one channel state.
-        """
+        """Return the checked problem; without a bucket the tokens are unlimited."""
         if len(sources) != 2:
             raise ConfigurationError(
                 f"sensors = {len(sources)} is not allowed for the joint optimum: it must be 2"

@@ -19,11 +19,8 @@ from fusion_gym.validation import ConfigurationError
 class Resolution(NamedTuple):
     """The resolution of a default grid.
 
-    Attributes:
-        finest: most points per standard deviation of the noise.
-        coarsest: least points per standard deviation of the noise.
-        points: approximate number of points within these limits.
-        negligible: probability of errors beyond the grid.
+    It has from ``coarsest`` to ``finest`` points per standard deviation of the noise, within these
+    limits about ``points`` points, and omits a ``negligible`` probability.
     """
 
     finest: float
@@ -77,22 +74,7 @@ class SourceProblem:
         bucket: TokenBucket | None = None,
         initial: ArrayLike | None = None,
     ) -> SourceProblem:
-        """Return the checked problem.
-
-        Args:
-            coefficient: a.
-            deviation: standard deviation σ of the noise.
-            price: price of a transmission.
-            error_weight: weight w of the squared error.
-            drop: probability of a loss in each channel state (S,).
-            transition: transition matrix of the channel (S, S).
-            bucket: the token bucket; None for unlimited tokens.
-            initial: law of the channel's state at time 0 (S,); the stationary law by default.
-
-        Raises:
-            ConfigurationError: a value that is not allowed, or no ``initial`` for a channel without
-                a unique stationary law.
-        """
+        """Return the checked problem, by default with unlimited tokens and the stationary law."""
         matrix = validation.array("transition", transition, (None, None))
         if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
             raise validation.refusal("transition", matrix, "a square matrix whose rows sum to 1")

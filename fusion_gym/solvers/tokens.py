@@ -38,15 +38,7 @@ class TokenLevels:
 
     @classmethod
     def create(cls, bucket: TokenBucket) -> TokenLevels:
-        """Enumerate the levels; an unlimited bucket has one.
-
-        Args:
-            bucket: the bucket.
-
-        Raises:
-            ConfigurationError: more than 500 levels, if rate, cost and capacity have no large
-                common divisor; or more than 12 sensors, since all sets of sensors are choices.
-        """
+        """Return the reachable levels of the bucket; an unlimited bucket has one level."""
         sensors = len(bucket.cost)
         if sensors > _MOST_SENSORS:
             raise ConfigurationError(

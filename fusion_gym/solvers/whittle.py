@@ -17,15 +17,7 @@ _found: dict[bytes, tuple[Array, Array]] = {}
 
 
 def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
-    """Return prices (P,) and the thresholds (P, S) at these prices.
-
-    Args:
-        number: number of the source, for error messages.
-        problem: the source.
-
-    Raises:
-        ConfigurationError: an unstable source, or thresholds that do not grow with the price.
-    """
+    """Return prices (P,) and the thresholds (P, S) at these prices."""
     key = pickle.dumps(replace(problem, price=0.0))
     if key not in _found:
         _found[key] = _solved(number, problem)

@@ -196,14 +196,7 @@ def algorithm_table(_: str) -> str:
 
 
 def settings(content: Any) -> AlgorithmConfig:
-    """Return the settings of an algorithm, in the class that the table has for its name.
-
-    Args:
-        content: a table with the name and the settings.
-
-    Raises:
-        ValueError: no settings, an unknown name or setting, or a value that is not allowed.
-    """
+    """Return the settings of an algorithm, in the class that the table has for its name."""
     if isinstance(content, AlgorithmConfig):
         return content
     if not isinstance(content, Mapping):

@@ -47,15 +47,7 @@ class Strict(pydantic.BaseModel):
 
 
 def config_path(name: str | Path, option: str = "config") -> Path:
-    """Return the file of a path, or the shipped config of a name (``tobit_oscillator_ppo``).
-
-    Args:
-        name: path or name.
-        option: name of the option, for error messages.
-
-    Raises:
-        ConfigurationError: a bare name that is neither; the message lists the shipped configs.
-    """
+    """Return the file of a path, or the shipped config of a name (``tobit_oscillator_ppo``)."""
     path = Path(name)
     if os.path.isfile(path) or path.suffix or path.name != str(name):
         return path
@@ -64,62 +56,23 @@ def config_path(name: str | Path, option: str = "config") -> Path:
 
 
 def load_checked(kind: type[Model], name: str | Path, option: str = "config") -> Model:
-    """Return the checked config of a path or shipped name.
-
-    Args:
-        kind: class of the config.
-        name: path or name.
-        option: name of the option, for error messages.
-
-    Raises:
-        ConfigurationError: an unreadable file, an unknown key, or a value that is not allowed;
-            names the file and the first such field.
-    """
+    """Return the checked config of a path or shipped name."""
     return parse(kind, read_yaml(name, option), str(name), option)
 
 
 def read_yaml(name: str | Path, option: str = "config") -> Any:
-    """Return the content of the config of a path or shipped name.
-
-    Args:
-        name: path or name.
-        option: name of the option, for error messages.
-
-    Raises:
-        ConfigurationError: no such file, or no YAML.
-    """
+    """Return the content of the config of a path or shipped name."""
     text = validation.read_text(option, config_path(name, option), str(name))
     return parsed(text, f"{option} {str(name)!r}")
 
 
 def parse(kind: type[Model], content: Any, source: str, option: str = "config") -> Model:
-    """Return the content as a checked model.
-
-    Args:
-        kind: class of the config.
-        content: the content.
-        source: name of the content in error messages.
-        option: name of the option, for error messages.
-
-    Raises:
-        ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and the
-            first such field.
-    """
+    """Return the content as a checked model; an error names ``source`` and the first field."""
     return checked(kind, content, f"{option} {source!r}")
 
 
 def checked(shape: type[Shape], content: Any, source: str) -> Shape:
-    """Return the content as an object of a type.
-
-    Args:
-        shape: the type.
-        content: the content.
-        source: name of the content in error messages.
-
-    Raises:
-        ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and the
-            first such field.
-    """
+    """Return the content as an object of a type; an error names the first wrong field."""
     try:
         return pydantic.TypeAdapter(shape).validate_python(content)
     except pydantic.ValidationError as error:

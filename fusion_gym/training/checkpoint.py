@@ -69,16 +69,7 @@ def save_checkpoint(
 
 
 def read_journal(path: Path) -> Journal:
-    """Return the journal of a checkpoint, without unpickling.
-
-    Every entry of the file is checked against its checksum.
-
-    Args:
-        path: the checkpoint.
-
-    Raises:
-        ConfigurationError: the file is damaged, or no checkpoint.
-    """
+    """Return the journal of a checkpoint after a check of all checksums, without unpickling."""
     try:
         with zipfile.ZipFile(path) as archive:
             broken = archive.testzip()

@@ -78,12 +78,7 @@ class Experiment(Strict):
         )
 
     def resolved(self, settings: Mapping[str, Any], sensors: int) -> Experiment:
-        """Return the experiment with numbers in the place of ``"auto"`` and ``many_sensors``.
-
-        Args:
-            settings: settings of the environment's task.
-            sensors: number of its sensors.
-        """
+        """Return the experiment with numbers in the place of ``"auto"`` and ``many_sensors``."""
         options, training = self.environment.options, self.training
         numbers = {
             name: settings[name]
@@ -100,16 +95,7 @@ class Experiment(Strict):
     def changed(
         self, output: str | Path | None, options: Mapping[str, Any] | None = None, **training: Any
     ) -> Experiment:
-        """Return the experiment with other output, options and training, checked again.
-
-        Args:
-            output: output folder; None for no change.
-            options: options of the environment to change.
-            **training: fields of the training; None for no change.
-
-        Raises:
-            ConfigurationError: a value that is not allowed.
-        """
+        """Return the experiment with other output, options and training, checked again."""
         plain = self.model_dump() | ({} if output is None else {"output": str(output)})
         environment = plain["environment"]
         environment["options"] |= open_options(environment["id"], options or {})

@@ -51,16 +51,7 @@ def prices_of(task: Task, episodes: int, seed: int) -> Array:
 
 
 def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[str, Any]]:
-    """Return rate and MSE of the episodes in each non-empty part of the range of prices.
-
-    Each part has the ends ``low`` and ``high`` of its prices, its number of ``episodes``, their
-    ``rate`` per sensor and step, and their ``mse``. The list is empty for a fixed price.
-
-    Args:
-        task: the task.
-        prices: price of a token in each episode (E,).
-        results: results of the episodes.
-    """
+    """Return rate and MSE of the episodes in each non-empty part of the range of prices."""
     span = task.reward.price.span
     if task.reward.price.fixed is not None or span is None:
         return []
@@ -80,15 +71,7 @@ def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[st
 
 
 def warn_of_unused_tokens(task: Task, results: EpisodeResults) -> None:
-    """Warn if an agent spends less than half of its tokens at its lowest price.
-
-    Args:
-        task: the task.
-        results: results at the lowest price.
-
-    Warns:
-        UserWarning: names the agent's share of the tokens that the bucket sustains.
-    """
+    """Warn if an agent spends less than half of its tokens at its lowest price."""
     sustained = sustained_tokens(task)
     share = float(results.tokens.mean()) / sustained if sustained else 1.0
     if share < 0.5 and not task.bucket.unlimited:

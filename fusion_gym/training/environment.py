@@ -15,16 +15,7 @@ if TYPE_CHECKING:
 def environment_of(
     env: str | None, config: str | None, settings: tuple[tuple[str, ...], ...]
 ) -> tuple[str, dict[str, Any], Experiment | None]:
-    """Return id, options and training of a command line.
-
-    Args:
-        env: id of an environment; it overrides the config.
-        config: path or name of a config.
-        settings: options as words; they override the options of the config.
-
-    Raises:
-        ConfigurationError: neither an id nor a config, or a config that is not allowed.
-    """
+    """Return id, options and training of a command line; ``settings`` override the config."""
     options = parse_settings("option", list(chain(*settings)))
     if config is None:
         if env is None:

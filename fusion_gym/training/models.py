@@ -28,15 +28,7 @@ _LEVEL = 0.99  # of the intervals together: one false warning in a hundred setti
 
 
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
-    """Return the training environment.
-
-    Args:
-        experiment: the config.
-        task: the task.
-
-    Raises:
-        ConfigurationError: actions that the algorithm does not support.
-    """
+    """Return the training environment."""
     name, local = experiment.algorithm.name, experiment.environment.local
     many = not local and task.action != "discrete" and task.access != "single"
     if TABLE[name].discrete_only and many:
@@ -79,16 +71,7 @@ def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
-    """Return a new model of the config's algorithm.
-
-    Args:
-        experiment: the config.
-        env: the training environment.
-
-    Raises:
-        ConfigurationError: settings that the algorithm's class refuses, or an ``initial_rate`` that
-            the action space does not allow.
-    """
+    """Return a new model of the config's algorithm."""
     settings = experiment.algorithm
     row = TABLE[settings.name]
     try:
@@ -116,9 +99,6 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
 
     Returns:
         Logits (sensors,) for ``MultiBinary``, or one per number of ``Discrete``.
-
-    Raises:
-        ConfigurationError: one sensor per step, and a sum of the rates of at least 1.
     """
     odds, space, sensors = np.log(rate / (1.0 - rate)), env.action_space, env.task.sensors
     if isinstance(space, MultiBinary):
@@ -149,15 +129,7 @@ def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
 
 
 def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
-    """Print the cross term with its interval, if the interval excludes zero.
-
-    The cross term is measured for two policies: random requests at the initial rate, and the policy
-    of the greatest value in the environment.
-
-    Args:
-        experiment: the config.
-        env: the training environment.
-    """
+    """Print the largest cross term of two usual policies if its interval excludes zero."""
     task, reference = env.task, env.batch.reference
     assert reference is not None  # present in the environment of such a training
     begins = getattr(experiment.algorithm, "initial_rate", None)

@@ -35,17 +35,7 @@ def holds_training(folder: Path) -> bool:
 
 
 def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | None:
-    """Return the journal of the training to resume, or None for a new training.
-
-    Args:
-        experiment: the config.
-        folder: the output folder.
-        resume: whether to resume.
-
-    Raises:
-        ConfigurationError: the folder contains a training and ``resume`` is false, there is nothing
-            to resume, the training has another config, or its checkpoint is damaged.
-    """
+    """Return the journal of the training to resume, or None for a new training."""
     where, checkpoint = f"the training in {str(folder)!r}", folder / "latest.zip"
     if not resume:
         if holds_training(folder):
@@ -70,14 +60,7 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
 
 
 def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, Task]:
-    """Return a new model, its environment and the task of its validation, without writing.
-
-    Args:
-        experiment: the config.
-
-    Raises:
-        ConfigurationError: a config or environment that does not fit.
-    """
+    """Return a new model, its environment and the task of its validation, without writing."""
     task = make_task(experiment.environment.id, **experiment.environment.options)
     env = make_env(experiment, task)
     return make_model(experiment, env), env, task

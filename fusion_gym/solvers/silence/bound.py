@@ -129,14 +129,7 @@ def cost_bound(
 
 
 def _price(model: SilenceModel, packets: float) -> tuple[float, SilenceSolution]:
-    """Return a price with about so many optimal packets per step, and its rough solution.
-
-    Every price gives a bound; this price gives a tight one.
-
-    Args:
-        model: the model of the task.
-        packets: packets per step.
-    """
+    """Return a price with about so many optimal packets per step, and its rough solution."""
     typical = float(np.einsum("tii,i->", model.problem.noise, model.problem.weights))
     typical /= model.problem.horizon
     solved: dict[float, tuple[float, SilenceSolution]] = {}

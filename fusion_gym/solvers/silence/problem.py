@@ -33,18 +33,7 @@ class SilenceProblem:
     def create(
         cls, transition: ArrayLike, weights: ArrayLike, noise: ArrayLike, price: float
     ) -> SilenceProblem:
-        """Return the checked problem.
-
-        Args:
-            transition: A (n, n).
-            weights: W (n,), all > 0.
-            noise: one covariance per step (H, n, n).
-            price: price of a packet, > 0.
-
-        Raises:
-            ConfigurationError: a wrong shape, a weight or a price that is not above 0, or a
-                covariance that is not symmetric positive semi-definite.
-        """
+        """Return the checked problem; ``noise`` is one covariance per step."""
         matrix = validation.array("transition", transition, (None, None))
         size = len(matrix)
         matrix = validation.array("transition", matrix, (size, size))
