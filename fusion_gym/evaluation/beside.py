@@ -23,7 +23,7 @@ Runs = NDArray[np.int64]
 class Brief(NamedTuple):
     """The results of E episodes of a policy, each averaged over an episode's steps.
 
-    Attributes:
+    Args:
         rate: transmissions (E,), the mean over the sensors.
         mse: squared error (E,), as in :class:`~fusion_gym.evaluation.episodes.EpisodeResults`.
         error_cost: error in the units of the reward (E,).

@@ -28,7 +28,7 @@ from fusion_gym.policies.base import Policy, owner_of, refused_signals
 class CrossTerm(NamedTuple):
     """The parts of a policy's error, each a mean over steps and episodes.
 
-    Attributes:
+    Args:
         rate: transmissions per sensor and step.
         error: squared error in the weights of the reward, scaled to a mean of 1.
         floor: the part E‖x - x*‖², in the same weights.
@@ -72,7 +72,7 @@ def cross_terms(
         policies: policies by name.
         episodes: episodes of each policy, >= 2.
         seed: seed of the first episode, >= 0.
-        level: confidence level of all intervals together.
+        level: joint confidence level of all intervals.
 
     Raises:
         ConfigurationError: fewer than two episodes, which have no interval, or a negative seed.

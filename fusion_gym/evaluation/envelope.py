@@ -16,7 +16,7 @@ FAR_APART = 1.5
 class EnvelopePoint(NamedTuple):
     """A policy on the envelope, with its means over episodes.
 
-    Attributes:
+    Args:
         name: name of the policy.
         rate: transmissions per sensor and step.
         mse: squared error per step, summed over states, in squared units of the states.
@@ -108,7 +108,7 @@ def _mixed(results: Mapping[str, EpisodeResults], shares: Mapping[str, float]) -
 class BaselineComparison(NamedTuple):
     """A policy against the envelope at the policy's rate, over paired episodes.
 
-    Attributes:
+    Args:
         difference: MSE of the policy minus MSE of the envelope, with its interval.
         envelope: MSE of the envelope at this rate.
         between: the policies of the mixture.
@@ -173,7 +173,7 @@ def compare_with_envelope(
 class PriceComparison(NamedTuple):
     """A policy against the best baseline at one price of a token, over paired episodes.
 
-    Attributes:
+    Args:
         price: price of a token.
         best: name of the best baseline.
         cost: mean cost of the best baseline per step.

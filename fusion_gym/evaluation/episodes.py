@@ -21,7 +21,7 @@ BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on t
 class EpisodeResults:
     """The results of E episodes of H steps; most fields are averages over an episode's steps.
 
-    Attributes:
+    Args:
         mse: squared error of the fused estimate (E,), summed over states.
         error_cost: error in the units of the reward (E,), >= 0.
         bound_trace: trace of the claimed covariance (E,).
@@ -171,7 +171,7 @@ def _run_batch(
 class Trajectory:
     """One episode of H steps, at the times 1..H.
 
-    Attributes:
+    Args:
         truth: true state (H, n).
         mean: fused estimate (H, n).
         variance: diagonal of the claimed covariance (H, n).

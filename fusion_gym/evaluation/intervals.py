@@ -14,7 +14,7 @@ RESAMPLES = 2000
 class Interval(NamedTuple):
     """A mean with the ends of its confidence interval.
 
-    Attributes:
+    Args:
         mean: mean of the samples.
         low: lower end.
         high: upper end.

@@ -15,7 +15,7 @@ from fusion_gym.validation import ConfigurationError
 class Metric(NamedTuple):
     """A metric of an evaluation: a row of the table of metrics.
 
-    Attributes:
+    Args:
         meaning: its meaning, in a few words.
         better: values that are better.
         axis: axis of one value each; without one the summary is a mean with its 95 % interval.

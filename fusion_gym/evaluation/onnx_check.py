@@ -28,7 +28,7 @@ Values = dict[str, NDArray[Any]]
 class Agreement(NamedTuple):
     """The agreement of an ONNX graph with its agent.
 
-    Attributes:
+    Args:
         observations: number of compared observations.
         episodes: number of their episodes.
         different: number of observations with another decision.

@@ -16,7 +16,7 @@ from fusion_gym.validation import ConfigurationError, refusal
 class Exported(NamedTuple):
     """A written ONNX file.
 
-    Attributes:
+    Args:
         size: bytes.
         inputs: shapes of the inputs by name.
         outputs: shapes of the outputs by name.

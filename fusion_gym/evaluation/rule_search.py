@@ -70,7 +70,7 @@ class Generation:
 
     Its JSON is ``dataclasses.asdict``, and ``Generation(**value)`` restores it.
 
-    Attributes:
+    Args:
         number: its number, from 0.
         objectives: objective of each candidate.
         mean: mean of the distribution after it, in the coordinates of the search.
@@ -85,7 +85,7 @@ class Generation:
 class SearchResult:
     """The result of a search.
 
-    Attributes:
+    Args:
         policy: the rule as text.
         prices: prices of a token.
         costs: cost of the rule at each price, on fresh episodes.

@@ -100,7 +100,7 @@ def source_thresholds(advantage: Array, points: Array) -> tuple[Array, bool]:
 class AverageSolution:
     """The stationary optimum.
 
-    Attributes:
+    Args:
         cost: cost per step, between ``lower`` and ``upper``.
         lower: lower bound of the cost.
         upper: upper bound of the cost.

@@ -29,7 +29,7 @@ CRITERIA = ("finite", "average")
 class Optimum:
     """The least expected cost, and requests by thresholds or by a table.
 
-    Attributes:
+    Args:
         cost: cost of an episode, the negative expected return, with ``criterion="finite"``; average
             cost per step with ``"average"``.
         error: w e² per step, summed over the sources; nan for a table.

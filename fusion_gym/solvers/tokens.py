@@ -22,9 +22,9 @@ class TokenLevels:
 
     A choice is a set of sensors, the bits of its number; choice 0 is silence.
 
-    Attributes:
+    Args:
         level: levels (K,) in ascending order.
-        initial: index of the first level.
+        initial: index of the level at the start.
         affordable: whether the network grants every request of the choice (K, choices), bool.
         following: index of the next level (K, choices).
         spent: tokens of each choice (choices,).

@@ -33,7 +33,7 @@ class RolloutBatch(NamedTuple):
 
     D is the number of factors of a decision and C the number of choices of a factor.
 
-    Attributes:
+    Args:
         observations: (B, entries), or with local decisions (B, sensors, entries).
         masks: (B, choices), or with local decisions (B, sensors, choices); None without masks.
         choices: the choices (B, D).

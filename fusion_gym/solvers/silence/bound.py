@@ -23,7 +23,7 @@ _CLOSE = 0.02  # tolerance of the logarithm of the price; the bound is flat at i
 class PricedCost:
     """Bounds of the least cost per step, error and packets, at a ``price`` of a packet.
 
-    Attributes:
+    Args:
         price: price of a packet.
         lower: proven lower bound.
         upper: cost of the lattice policy plus three standard errors.
@@ -49,7 +49,7 @@ class PricedCost:
 class SilenceBound:
     """A lower bound of the error of every policy.
 
-    Attributes:
+    Args:
         floor: error of a centre that knows everything at once, averaged over an episode's steps.
         sensors: number of sensors.
         costs: bounds in the order of their prices.

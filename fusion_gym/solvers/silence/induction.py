@@ -29,7 +29,7 @@ _SHARES = np.linspace(0.05, 0.95, 19)[:, None, None, None]
 class Stage:
     """The solution at one time, on a lattice of the step ``step``.
 
-    Attributes:
+    Args:
         coordinates: coordinates of the lattice.
         step: distance of its points.
         silent: semi-axes (n,) of an ellipsoid, in the coordinates, with every e at which silence
