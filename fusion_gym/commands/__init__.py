@@ -1,8 +1,8 @@
-"""The commands: search, train, evaluate, compare and more."""
+"""The commands of fusion-gym."""
 
 
 def missing_extra(error: BaseException) -> str | None:
-    """The line that says what to install, if the error is that a package is missing."""
+    """Return the line about the packages to install if the error is a missing package."""
     if not isinstance(error, ModuleNotFoundError):
         return None
     missing = error.name or str(error)

@@ -15,7 +15,7 @@ COMMANDS = ("compare", "demo", "evaluate", "export", "info", "list", "search", "
 
 
 def usage() -> str:
-    """Return every command with the first sentence of its module."""
+    """Return every command with the first line of its module's docstring."""
     lines = ["usage: fusion-gym COMMAND [OPTIONS]", ""]
     for name in COMMANDS:
         text = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
@@ -24,11 +24,7 @@ def usage() -> str:
 
 
 def main() -> None:
-    """Run the command line of ``fusion-gym``, which needs the packages of the extra ``agents``.
-
-    Raises:
-        SystemExit: as :func:`report_errors`; an unknown command (2).
-    """
+    """Run the command line of ``fusion-gym``."""
     name = sys.argv[1] if sys.argv[1:] else "--help"
     with report_errors():
         if name in ("-h", "--help", "--version"):
@@ -40,11 +36,7 @@ def main() -> None:
 
 
 def load(name: str) -> Any:
-    """Return the class of a command.
-
-    Raises:
-        SystemExit: no such command (2), or a package that it needs is not installed (1).
-    """
+    """Return the class of a command."""
     try:
         module = importlib.import_module(f"fusion_gym.commands.{choice('command', name, COMMANDS)}")
         return getattr(module, name.capitalize())

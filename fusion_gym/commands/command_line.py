@@ -1,4 +1,4 @@
-"""How every command reads its options, reports an error and ends."""
+"""Read the options of every command, report its errors and end it."""
 
 import contextlib
 import inspect
@@ -21,7 +21,7 @@ from fusion_gym.output.ending import flush, report_errors
 from fusion_gym.output.progress import quietly
 from fusion_gym.validation import CONTROL, ConfigurationError
 
-Words = tuple[tuple[str, ...], ...]  # of an option that may be given several times
+Words = tuple[tuple[str, ...], ...]  # words of a repeatable option
 SetOptions = Annotated[
     Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
 ]
@@ -38,13 +38,13 @@ def program_of(kind: type["Command"]) -> str:
 
 @dataclass(frozen=True)
 class Command(ABC):
-    """A command: its fields are its options, its docstring and theirs are its help."""
+    """A command, whose fields are its options and whose docstring and field texts are its help."""
 
-    program: ClassVar[str] = ""  # the words that run it, where it is none of fusion-gym
+    program: ClassVar[str] = ""  # the words that run a command outside fusion-gym
 
     @classmethod
     def main(cls) -> None:
-        """Read the command, check its options and do it.
+        """Read the command line, check the options and run the command.
 
         Raises:
             SystemExit: as :func:`report_errors`; status 130 after an interrupt.
@@ -63,37 +63,37 @@ class Command(ABC):
 
     @abstractmethod
     def run(self) -> None:
-        """Do the work.
+        """Run the command.
 
         Raises:
-            ConfigurationError: anything that is not allowed.
+            ConfigurationError: an option that is not allowed.
             KeyboardInterrupt: the work was interrupted.
         """
 
     def interrupted(self) -> str:
-        """What to say after an interrupt."""
+        """Return the message after an interrupt."""
         return "interrupted"
 
 
 @dataclass(frozen=True)
 class Long(Command):
-    """A command that may take long: it shows where it is, and says how to go on."""
+    """A command with long work, which shows its progress and how to resume."""
 
     quiet: bool = field(default=False, kw_only=True)
-    """Show neither progress nor remarks: results and errors alone."""
+    """Show only results and errors, without progress and remarks."""
     trust: bool = field(default=False, kw_only=True)
-    """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
+    """Run code of files: objects named as module:name, and code in the file of model:PATH."""
 
-    keeps: ClassVar[bool] = True  # what is finished, before all of it is
+    keeps: ClassVar[bool] = True  # whether an interrupt keeps finished parts
 
     def interrupted(self) -> str:
-        """The command line that goes on, where something is kept."""
+        """Return the command line that resumes the work, if a part is saved."""
         if not self.keeps:
             return "interrupted: nothing is kept"
         return f"interrupted; go on with: {self.again()}"
 
     def again(self) -> str:
-        """The words of the command line, with ``--resume`` where it has that."""
+        """Return the words of the command line, with ``--resume`` where it exists."""
         more = ["--resume"] if "resume" in {item.name for item in fields(self)} else []
         words = [word for word in sys.argv[1:] if word not in more]
         return f"{program_of(type(self))} {shlex.join([*words, *more])}"
@@ -101,14 +101,14 @@ class Long(Command):
 
 @dataclass(frozen=True)
 class EnvironmentOptions:
-    """The options of a command about one environment."""
+    """The options of a command for one environment."""
 
     env: str | None = field(default=None, kw_only=True)
     """Id of a registered environment."""
     config: str | None = field(default=None, kw_only=True)
-    """Take environment and options from a training's YAML, or from a shipped config by its name."""
+    """Take environment and options from the YAML file of a training or from a shipped config."""
     options: SetOptions = field(default=(), kw_only=True)
-    """Options of gym.make for the environment; they go before all others."""
+    """Options of gym.make for the environment; they override all others."""
 
 
 _REGISTRY = tyro.constructors.ConstructorRegistry()
@@ -118,7 +118,7 @@ _REGISTRY = tyro.constructors.ConstructorRegistry()
 def _optional(
     info: tyro.constructors.PrimitiveTypeInfo,
 ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    """Read and show ``X | None`` as X: an option that is left out is None."""
+    """Parse ``X | None`` as X; a missing option is None."""
     parts = get_args(info.type)
     if len(parts) != 2 or parts[1] is not type(None):
         return None
@@ -130,13 +130,7 @@ def _optional(
 
 
 def read_command(kind: type[_Kind]) -> _Kind:
-    """The command with the options of the command line.
-
-    Raises:
-        SystemExit: help was asked for (status 0), or an option is not understood (2, after one
-            line that says which).
-        ConfigurationError: a word is empty, or no text.
-    """
+    """Return the command with the options of the command line."""
     _check_words()
     output = io.StringIO()
     try:
@@ -156,26 +150,20 @@ def read_command(kind: type[_Kind]) -> _Kind:
 
 
 def _check_words() -> None:
-    """Every word is text that can be written into a file, and not empty.
-
-    An empty word is a variable of the shell that is not set; as a path it would be this folder.
-
-    Raises:
-        ConfigurationError: one is not.
-    """
+    """Check that every word of the command line is non-empty text without control characters."""
     option = "the command line"
     for word in sys.argv[1:]:
         named = word.startswith("--")
         option = word.strip("-").partition("=")[0] if named else option
         if not word or (named and word.endswith("=")):
             raise ConfigurationError(f"{option} = '' is not allowed: it must not be empty")
-        if re.search(CONTROL, word):  # bytes that were no text among them
+        if re.search(CONTROL, word):  # undecodable bytes included
             allowed = "UTF-8 without control characters"
             raise ConfigurationError(f"{option} = {word!r} is not allowed: it must be {allowed}")
 
 
 def _essence(message: str) -> str:
-    """What tyro says below its title and above the next rule, as one line."""
+    """Return the text between tyro's title and the next rule, as one line."""
     lines = [re.sub(r"\x1b\[[\d;]*m", "", line).strip("│ ") for line in message.splitlines()[1:]]
     body = itertools.dropwhile(_is_rule, lines)
     return " ".join(itertools.takewhile(lambda line: not _is_rule(line), body)).removeprefix(

@@ -1,15 +1,16 @@
-"""Compare one policy with swept baselines: at its price, and at its rate.
+r"""Compare one policy with swept baselines: at its price, and at its rate.
 
     fusion-gym compare --config configs/biased_oscillator_ppo.yaml \\
         --sweep configs/biased_sweep.yaml \\
         --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
 
-An agent that sees the price of a token, or a rule with a parameter ``price``, runs at as many
-prices as ``--prices`` says. All policies run on the same seeds. The cost at a price is error +
-price · tokens; the best baseline at each price stands beside the agent. At its rate its MSE stands
-beside the baselines' lower envelope.
-Into the output folder go ``evaluation.json`` (every policy), ``comparison.json`` (the verdict) and
-``pareto.png``.
+All policies run on the same seeds. An agent that observes the price of a token, or a rule with a
+parameter ``price``, runs at ``--prices`` prices. At each price the table shows the agent and the
+baseline of the least cost, where cost = error + price · tokens. At the agent's rate the table shows
+its MSE and the MSE of the baselines' lower envelope.
+
+The output folder contains ``evaluation.json`` (every policy), ``comparison.json`` (the comparison)
+and ``pareto.png``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,9 +51,9 @@ class Compare(Long):
     """Compare one policy with swept baselines: at its price, and at its rate."""
 
     config: str
-    """A training's YAML, or the name of a shipped one: its environment."""
+    """The environment: the YAML file of a training, or the name of a shipped config."""
     sweep: str
-    """The baselines' YAML, or the name of a shipped one."""
+    """The baselines: a YAML file, or the name of a shipped sweep."""
     policy: str
     """The policy, for example model:PATH."""
     output: Annotated[Path, OutputFolder()]
@@ -62,12 +63,12 @@ class Compare(Long):
     seed: Seed = 0
     """Seed of the first episode."""
     prices: Annotated[int | None, Whole(2, 1000)] = None
-    """Ask a policy with a parameter price at as many, over the config's price_range."""
+    """Run the policy at this many prices over the config's price_range."""
 
     keeps = False
 
     def run(self) -> None:
-        """Run all policies on the same seeds; write, print and draw the comparison."""
+        """Run all policies on the same seeds, and write, print and draw the comparison."""
         world = load_checked(Experiment, self.config).environment
         sweep = load_checked(Sweep, self.sweep, "sweep")
         task = make_task(world.id, **world.options)
@@ -80,13 +81,7 @@ class Compare(Long):
         compare(world.id, task, sweep, baselines, requested, self.seed, self.output)
 
     def policies_of(self, task: Task) -> dict[str, float]:
-        """The policy, or the policy at each of the prices, with the price of a token.
-
-        A price that is drawn stands for the middle of its range.
-
-        Raises:
-            ConfigurationError: prices, but none that is drawn, or a policy that takes no price.
-        """
+        """Return the policy, or the policy at each price, with the price of a token."""
         if self.prices is None:
             return {self.policy: float(task.reward.price.draw(np.array([0.5]))[0])}
         span = task.reward.price.span
@@ -97,9 +92,9 @@ class Compare(Long):
         if name not in policy_names() or "price" not in policy_parameters(name):
             reason = f"left out with policy = {self.policy!r}, which takes no price"
             raise refusal("prices", self.prices, reason)
-        low, high = (repr(float(end)) for end in span)  # to the last digit: it knows no others
+        low, high = (repr(float(end)) for end in span)  # all digits, to stay within the range
         inner = [f"{price:.4g}" for price in np.geomspace(*span, self.prices)[1:-1]]
-        # Text may follow that belongs to a base; the first text of an agent is its file or name.
+        # The text of a base may follow; the first text of an agent is its file or name.
         form = "{0}:{1},price={2}" if name in policy_names("agent") else "{0}:price={2},{1}"
         prices = (low, *inner, high)
         return {form.format(name, text, p).rstrip(","): float(p) for p in prices}
@@ -108,7 +103,7 @@ class Compare(Long):
 def run_all(
     task: Task, policies: list[str], episodes: int, seed: int, description: str
 ) -> dict[str, EpisodeResults]:
-    """Run every policy on the same seeds, with a bar of progress."""
+    """Run every policy on the same seeds, with a progress bar."""
     built = {name: make_policy(name, task) for name in policies}
     total = len(policies) * episodes * task.horizon
     with progress_bar(total, description) as bar:
@@ -123,13 +118,7 @@ def compare(
     env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
     agents: Mapping[str, float], seed: int, folder: Path,
 ) -> None:  # fmt: skip
-    """Run the agent, or the agent at each of its prices, on the baselines' episodes.
-
-    Writes, prints and draws the comparison.
-
-    Raises:
-        ConfigurationError: the agent transmits less than every baseline.
-    """
+    """Run the agent on the baselines' episodes, and write, print and draw the comparison."""
     episodes = next(iter(baselines.values())).episodes
     learned = run_all(task, list(agents), episodes, seed, "agent")
     points = []
@@ -171,7 +160,7 @@ class Point:
     at_rate: BaselineComparison
 
     def plain(self) -> dict[str, Any]:
-        """Return the point as JSON has it."""
+        """Return the point as JSON."""
         result = asdict(self)
         for name in ("at_price", "at_rate"):
             comparison = getattr(self, name)
@@ -186,7 +175,7 @@ def _label(agents: Sequence[str]) -> str:
 
 
 def price_table(points: Sequence[Point], baselines: Mapping[str, EpisodeResults]) -> Table:
-    """The agent against the best baseline at each of its prices."""
+    """Return the table of the agent and the best baseline at each of its prices."""
     rows = []
     for point in points:
         price, best, cost, difference = point.at_price
@@ -206,7 +195,7 @@ def price_table(points: Sequence[Point], baselines: Mapping[str, EpisodeResults]
 
 
 def rate_table(points: Sequence[Point]) -> Table:
-    """The agent against the envelope, at its own rate at each of its prices."""
+    """Return the table of the agent and the envelope, at the agent's rate for each price."""
     rows = []
     for point in points:
         comparison = point.at_rate
@@ -217,7 +206,7 @@ def rate_table(points: Sequence[Point]) -> Table:
             f"{point.mse:.4f}",
             f"{comparison.envelope:.4f}" + (" *" if comparison.far_apart else ""),
             tables.difference(comparison.difference),
-            # Whoever always transmits over a perfect channel has no error to compare with.
+            # Without an error, as with a perfect channel, there is no share.
             "–" if np.isnan(share) else f"{share:+.1%}",
         )
         rows.append(row)

@@ -2,9 +2,10 @@
 
     fusion-gym demo [--output runs/demo] [--episodes 1000] [--resume]
 
-An agent learns in LinearFusion and one in the Tobit oscillator. Each sees all new measurements and
-the price of a token, with memory of what was not sent. At seven prices its cost stands beside that
-of the best rule of ``scale_free_sweep``, with the same memory and on the same episodes.
+One agent learns in LinearFusion and one in the Tobit oscillator. Each agent observes all new
+measurements and the price of a token, with memory of unsent measurements. A table shows its cost at
+seven prices and the cost of the best rule of ``scale_free_sweep``, with the same memory and on the
+same episodes.
 """
 
 from dataclasses import dataclass
@@ -29,12 +30,12 @@ class Demo(Long):
     episodes: Episodes = 1000
     """Episodes of each policy."""
     timesteps: Steps = None
-    """Steps of each training, instead of the configs'."""
+    """Steps of each training, instead of the steps in the configs."""
     resume: bool = False
-    """Go on with the trainings in the folder, of your own: they hold pickles."""
+    """Continue the trainings in the folder; resume only your own, since they contain pickles."""
 
     def run(self) -> None:
-        """Train and compare, one environment after the other."""
+        """Train and compare in one environment after the other."""
         for name, config in CONFIGS.items():
             folder = self.output / name
             agent = folder / "agent"

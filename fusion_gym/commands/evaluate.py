@@ -1,10 +1,10 @@
-"""Evaluate policies on paired episodes.
+r"""Evaluate policies on paired episodes.
 
     fusion-gym evaluate --env fusion_gym/TobitOscillator-v1 --set filter=tobit \\
         --policies always dynamic_event innovation_threshold:threshold=1 --reference always
 
-Every policy runs on the same seeds, so that the same noise meets every policy. The JSON is
-written after each policy; with ``--resume`` the policies that it already holds are not run again.
+Every policy runs on the same seeds, so all policies meet the same noise. The command writes the
+JSON after each policy; with ``--resume`` it skips the policies that the JSON already contains.
 """
 
 import json
@@ -32,7 +32,7 @@ from fusion_gym.training.checked import checked
 from fusion_gym.training.environment import environment_of
 from fusion_gym.validation import ConfigurationError, refusal
 
-_DRAWN = 100  # episodes by which drawn actions are compared with the likeliest
+_DRAWN = 100  # episodes of the comparison of drawn with likeliest actions
 
 
 class Quantiles(pydantic.BaseModel):
@@ -73,18 +73,18 @@ class Evaluate(EnvironmentOptions, Long):
     seed: Seed = 0
     """Seed of the first episode."""
     reference: str | None = None
-    """One of the policies: print paired differences to it."""
+    """One of the policies; print paired differences to it."""
     json: Annotated[Path | None, OutputFile(".json")] = None
     """Write the results to this file."""
     resume: bool = False
-    """Keep what the JSON already holds."""
+    """Skip the policies that the JSON already contains."""
 
     def run(self) -> None:
-        """Evaluate and print the tables."""
+        """Evaluate the policies and print the tables."""
         evaluate(self)
 
     def interrupted(self) -> str:
-        """Finished policies are in the JSON; a reference needs the episodes of all."""
+        """Return how to resume; paired differences need a new evaluation."""
         if self.json is None:
             return "interrupted: nothing is kept (--json FILE keeps finished policies)"
         if self.reference is not None:
@@ -93,11 +93,7 @@ class Evaluate(EnvironmentOptions, Long):
 
 
 def evaluate(command: Evaluate) -> dict[str, Any]:
-    """Run the evaluation that the command line asks for and return what the JSON holds.
-
-    Raises:
-        ConfigurationError: anything that is not allowed, before the first episode.
-    """
+    """Run the evaluation of a command line and return its JSON."""
     env_id, options, _ = environment_of(command.env, command.config, command.options)
     task = make_task(env_id, **options)
     names = list(dict.fromkeys(chain(*command.policies)))
@@ -151,7 +147,7 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
 def warn_of_draws(
     name: str, task: Task, policy: Policy, results: EpisodeResults, seed: int
 ) -> None:
-    """Say it where an agent whose likeliest actions were taken does otherwise by drawn ones."""
+    """Print a remark if drawn actions change the return of an agent significantly."""
     if not getattr(policy, "deterministic", False):
         return
     drawn = make_policy(f"{name},deterministic=false", task)
@@ -169,7 +165,7 @@ def warn_of_draws(
 def evaluation_report(
     env_id: str, task: Task, episodes: int, seed: int, results: Mapping[str, EpisodeResults]
 ) -> dict[str, Any]:
-    """Return what the JSON of an evaluation holds."""
+    """Return the JSON of an evaluation."""
     return {
         "env": env_id,
         "episodes": episodes,
@@ -183,11 +179,7 @@ def evaluation_report(
 
 
 def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
-    """What an earlier run of the same evaluation has written.
-
-    Raises:
-        ConfigurationError: no file is named, or it holds no evaluation, or another one.
-    """
+    """Return the JSON of an earlier run of the same evaluation."""
     if path is None:
         raise ConfigurationError("resume = True is not allowed without json: there is no file")
     if not path.exists():

@@ -1,9 +1,10 @@
-"""Export a saved agent as an ONNX file, for sensors and schedulers that run without this library.
+"""Export a saved agent as an ONNX file, for sensors and schedulers without this library.
 
     fusion-gym export zoo:tobit_oscillator_scheduler,price=0.2 --onnx scheduler.onnx
 
-The file has everything from the observation to the request, and says what the observation is. It is
-checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.
+The file contains the graph from the observation to the request, and a description of the
+observation. The command compares it with the agent on 10,000 observations of whole episodes, and
+removes it if they differ.
 """
 
 from dataclasses import dataclass
@@ -35,29 +36,24 @@ class Export(EnvironmentOptions, Command):
     onnx: Annotated[Path, OutputFile(".onnx")]
     """The file to write."""
     trust: bool = False
-    """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
+    """Run code of files: objects named as module:name, and code in the file of model:PATH."""
 
     def run(self) -> None:
-        """Write the file, check it and say what it is."""
+        """Write the file, check it and print its description."""
         for line in export(self):
             print(line)
 
     def interrupted(self) -> str:
-        """A file that is not checked is not kept."""
+        """Return the message after an interrupt, which leaves no file."""
         return f"interrupted: no new file in {self.onnx}"
 
 
 def export(command: Export) -> list[str]:
-    """Write the file and return what there is to say of it, in lines.
-
-    Raises:
-        ConfigurationError: anything that is not allowed, or a graph that decides otherwise than the
-            agent; then no file is written.
-    """
+    """Write the file and return its description in lines; a wrong graph leaves no file."""
     kind, _, rest = spec(command.model).partition(":")
     env_id, options = _environment(command, kind, rest.partition(",")[0])
     require("onnx", "onnx", "onnx", "onnxruntime")
-    # Here, for it needs torch, which takes seconds to load.
+    # Imported here, because torch takes seconds to load.
     from fusion_gym.evaluation.onnx_export import export_onnx
 
     task = make_task(env_id, **options)
@@ -82,11 +78,7 @@ def export(command: Export) -> list[str]:
 
 
 def spec(text: str) -> str:
-    """The agent as policies are named: ``model:`` stands before a bare path.
-
-    Raises:
-        ConfigurationError: a policy that is no saved agent.
-    """
+    """Return the agent as a policy's text, with ``model:`` before a bare path."""
     kind, colon, _ = text.partition(":")
     if colon and kind in _KINDS:
         return text
@@ -96,11 +88,7 @@ def spec(text: str) -> str:
 
 
 def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:
-    """Id and options: those given, else those that the agent was trained in.
-
-    Raises:
-        ConfigurationError: neither is known.
-    """
+    """Return id and options of the command line, or of the agent's training by default."""
     config = command.config
     if command.env is None and config is None:
         if kind == "zoo":

@@ -3,7 +3,7 @@
     fusion-gym info fusion_gym/LinearFusion-v2
     fusion-gym info value_of_information
 
-``fusion-gym list`` has all names.
+``fusion-gym list`` shows all names.
 """
 
 from dataclasses import dataclass
@@ -24,14 +24,10 @@ class Info(Command):
     """Show the page of an environment, rule, filter, signal, agent or config."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """A name from fusion-gym list; an environment may go without fusion_gym/ and its version."""
+    """A name of fusion-gym list; an environment's name may omit fusion_gym/ and the version."""
 
     def run(self) -> None:
-        """Print the page of every entry of this name.
-
-        Raises:
-            ConfigurationError: an unknown name.
-        """
+        """Print the page of every entry of this name."""
         entries = catalogue()
         name = present_id(self.name)
         names = [entry for named in entries.values() for entry in named]

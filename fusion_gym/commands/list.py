@@ -1,10 +1,10 @@
-"""List what the suite has: environments, rules, filters, signals, agents, configs.
+"""List the environments, rules, filters, signals, agents and configs of the library.
 
     fusion-gym list
     fusion-gym list environments rules
 
-Without a kind it is an overview, with kinds a line for each entry; ``fusion-gym info NAME`` shows
-the page of an entry.
+Without a kind it prints an overview, with kinds one line for each entry. ``fusion-gym info NAME``
+shows the page of an entry.
 """
 
 from dataclasses import dataclass
@@ -23,17 +23,13 @@ from fusion_gym.validation import keys
 
 @dataclass(frozen=True)
 class List(Command):
-    """List what the suite has."""
+    """List the environments, rules, filters, signals, agents and configs of the library."""
 
     kinds: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KIND")] = ()
-    """Kinds to list, such as environments or rules; without one the overview."""
+    """Kinds to list, such as environments or rules; the overview by default."""
 
     def run(self) -> None:
-        """Print a table of each kind, or the environments and the names of all else.
-
-        Raises:
-            ConfigurationError: an unknown kind; the message lists all.
-        """
+        """Print a table of each kind, or the environments and the names of all other kinds."""
         entries = catalogue()
         keys("kind", self.kinds, entries)
         tables = {kind: entries[kind] for kind in self.kinds}

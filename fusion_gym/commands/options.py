@@ -1,9 +1,10 @@
-"""What an option may be: marks in the types of a command's fields, checked before anything runs.
+"""Marks in the types of a command's fields: the allowed values of its options.
 
     episodes: Annotated[int, Whole(at_least=1)] = 1000
     json: Annotated[Path | None, OutputFile(".json")] = None
 
-``None`` stands for an option that is not given; of a list every entry is checked.
+The marks are checked before the command runs. ``None`` is an option without a value; in a list
+every entry is checked.
 """
 
 import errno
@@ -20,15 +21,11 @@ from fusion_gym.validation import integer, number, refusal
 
 
 class Mark(ABC):
-    """What is allowed of an option."""
+    """The allowed values of an option."""
 
     @abstractmethod
     def check(self, option: str, value: Any) -> None:
-        """Look at one value.
-
-        Raises:
-            ConfigurationError: it is not allowed.
-        """
+        """Check one value."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class Whole(Mark):
     at_most: int | None = None
 
     def check(self, option: str, value: Any) -> None:
-        """Look at one number."""
+        """Check one number."""
         integer(option, value, at_least=self.at_least, at_most=self.at_most)
 
 
@@ -51,47 +48,43 @@ class Between(Mark):
     at_most: float
 
     def check(self, option: str, value: Any) -> None:
-        """Look at one number."""
+        """Check one number."""
         number(option, value, above=self.above, at_most=self.at_most)
 
 
 class OutputFolder(Mark):
-    """A folder that can be written, or made."""
+    """A folder that can be written or created."""
 
     def check(self, option: str, value: Any) -> None:
-        """Try it out, and leave nothing behind."""
+        """Check that the folder can be written, without a trace."""
         writable_folder(option, Path(value))
 
 
 class OutputFile(Mark):
-    """A file that can be replaced, or made; its ending says that it holds what is written."""
+    """A file with one of the given endings, which can be replaced or created."""
 
     def __init__(self, *endings: str) -> None:
         self.endings = endings
 
     def check(self, option: str, value: Any) -> None:
-        """Look at its ending, unless it is a device; try its folder out, and leave nothing."""
+        """Check the ending of a path, unless it is a device, and that its folder can be written."""
         path = Path(value)
-        device = os.path.exists(path) and not os.path.isfile(path)  # false where it cannot be seen
+        device = os.path.exists(path) and not os.path.isfile(path)  # false without access
         if path.suffix.lower() not in self.endings and not device:
             raise refusal(option, str(path), f"a file that ends with {' or '.join(self.endings)}")
         writable_file(option, path)
 
 
-# Beyond these numbers nothing ends, or finds room.
+# Larger numbers would exceed any time or memory.
 Episodes = Annotated[int, Whole(1, 100_000_000)]
 Steps = Annotated[int | None, Whole(1, 10**12)]
 Seed = Annotated[int, Whole(0)]
-_TRAINING = Whole(0, 2**32 - 1)  # as torch and numpy take it
+_TRAINING = Whole(0, 2**32 - 1)  # the limits of torch and numpy
 TrainingSeed = Annotated[int | None, _TRAINING]
 
 
 def check_options(values: Any) -> None:
-    """Check every field of a command by its marks.
-
-    Raises:
-        ConfigurationError: the first that is not allowed.
-    """
+    """Check every field of a command by its marks."""
     hints = typing.get_type_hints(type(values), include_extras=True)
     for field in fields(values):
         value = getattr(values, field.name)
@@ -113,31 +106,19 @@ def _refuse_input(values: Any, option: str, path: Path) -> None:
 
 
 def writable_folder(option: str, folder: Path) -> None:
-    """Try whether files can be written into a folder, which need not be there yet.
-
-    Nothing is left behind, neither the folder nor a file.
-
-    Raises:
-        ConfigurationError: they cannot.
-    """
+    """Check, without a trace, that files can be written into a folder, which need not exist."""
     _try_out(option, folder, "a folder that can be written", lambda: _write_in(folder))
 
 
 def writable_file(option: str, file: Path) -> None:
-    """Try whether a file can be replaced, or made; neither it nor its folder need be there yet.
-
-    Nothing is left behind, and what the file holds is kept.
-
-    Raises:
-        ConfigurationError: it cannot.
-    """
+    """Check, without a trace, that a file can be replaced or created."""
 
     def write() -> None:
         if file.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if file.is_symlink() and not file.exists():
             raise FileNotFoundError(errno.ENOENT, f"a link to {os.readlink(file)}, which is absent")
-        if file.is_file() or not file.exists():  # nothing can be tried of a pipe or a terminal
+        if file.is_file() or not file.exists():  # a pipe or a terminal cannot be tested
             _write_in(file.resolve().parent)
 
     _try_out(option, file, "a file that can be written", write)
@@ -146,13 +127,13 @@ def writable_file(option: str, file: Path) -> None:
 def _try_out(option: str, path: Path, allowed: str, write: Callable[[], object]) -> None:
     try:
         write()
-    except (OSError, ValueError) as error:  # a ValueError of a path that no system knows
+    except (OSError, ValueError) as error:  # a ValueError for an invalid path
         reason = getattr(error, "strerror", None) or str(error)
         raise refusal(option, str(path), f"{allowed} ({reason})") from None
 
 
 def _write_in(folder: Path) -> None:
-    """Write a file without a name into the folder, or into the nearest one above that is there."""
+    """Write a nameless file into the folder, or into its nearest existing parent."""
     while not folder.is_symlink() and not folder.exists() and folder != folder.parent:
         folder = folder.parent
     with tempfile.TemporaryFile(dir=folder, buffering=0) as file:

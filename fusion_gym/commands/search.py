@@ -1,15 +1,16 @@
-"""Search one rule for all prices of a token; an interrupted search can be gone on with.
+r"""Search one rule for all prices of a token; an interrupted search can be resumed.
 
     fusion-gym search --env fusion_gym/LinearFusion-v2 --set system=plant.yaml token_rate=.5 \\
         --output runs/search [--resume]
 
-The rule is ``priced_threshold``: a threshold that follows the price, the tokens and the silence.
-A search over its dozen numbers (CMA-ES) begins with the best single threshold at each price. The
-prices lie evenly, as logarithms, over the price_range of the environment, by default ``auto``.
+The rule is ``priced_threshold``, whose threshold depends on the price, the tokens and the age. The
+search over its dozen numbers (CMA-ES) starts from the best single threshold at each price. The
+prices are evenly spaced on a logarithmic scale over the price_range of the environment, by default
+``auto``.
 
-Into the output folder go ``generations.json``, after every generation, and at the end
-``search.json``: the policy as one line, its cost at each price on fresh episodes, and the cost of
-the best single threshold there.
+The command writes ``generations.json`` into the output folder after every generation, and
+``search.json`` at the end. The latter contains the rule as text, its cost at each price on fresh
+episodes, and the cost of the best single threshold there.
 """
 
 from dataclasses import asdict, dataclass
@@ -51,21 +52,21 @@ class Search(EnvironmentOptions, Long):
     output: Annotated[Path, OutputFolder()]
     """Folder of the search."""
     of: Annotated[ClassName, tyro.conf.arg(name="class")] = "scheduler"
-    """Who decides: a scheduler that sees all sensors, every sensor for itself, or the centre."""
+    """Who decides: a scheduler with all measurements, every sensor locally, or the centre."""
     prices: Annotated[int, Whole(2, 100)] = 5
-    """Prices of a token, from the lowest to the highest."""
+    """Number of prices of a token, from the lowest to the highest."""
     generations: Annotated[int, Whole(1, 10_000)] = 30
-    """Generations of the search."""
+    """Number of generations."""
     resume: bool = False
-    """Go on after the generations that the folder holds."""
+    """Continue after the generations in the folder."""
 
     def run(self) -> None:
-        """Search; write and print the rule."""
+        """Search, write and print the rule."""
         env_id, options, _ = environment_of(self.env, self.config, self.options)
         search = self.rule_search(env_id, options)
         inputs: dict[str, Any] = {"env": env_id, "class": self.of, "prices": search.prices}
         inputs |= {"generations": self.generations, "settings": search.task.settings}
-        self.earlier(inputs)  # refuses before anything is made
+        self.earlier(inputs)  # refuses before it creates a folder
         with alone_in(self.output, "output"):
             writing(("the generations and the rule", self.output))
             result = self.continued(search, inputs)
@@ -74,11 +75,7 @@ class Search(EnvironmentOptions, Long):
         tables.console().print(result_table(env_id, result))
 
     def rule_search(self, env_id: str, options: dict[str, Any]) -> RuleSearch:
-        """The search of the class in this environment.
-
-        Raises:
-            ConfigurationError: an option that is not allowed, or a class that has no such rule.
-        """
+        """Return the search of the class in this environment."""
         task = make_task(env_id, **options)
         prices = token_prices(env_id, options, task, self.prices)
         result = search_of_class(self.of, task, prices, generations=self.generations)
@@ -86,7 +83,7 @@ class Search(EnvironmentOptions, Long):
         return result
 
     def continued(self, search: RuleSearch, inputs: dict[str, Any]) -> SearchResult:
-        """The result of the search, with every generation in the file."""
+        """Run the search after its earlier generations, and write every generation to the file."""
         generations = self.earlier(inputs)
         initial = len(generations)
 
@@ -106,12 +103,7 @@ class Search(EnvironmentOptions, Long):
             return search_rule(search, tuple(generations), progress)
 
     def earlier(self, inputs: dict[str, Any]) -> list[Generation]:
-        """The generations that the folder holds, of the same search.
-
-        Raises:
-            ConfigurationError: the folder holds a search and ``resume`` is false, there is nothing
-                to resume, or the search there had other inputs.
-        """
+        """Return the generations in the folder, of the same search."""
         path, place = self.output / _GENERATIONS, f"output = {str(self.output)!r}"
         if not self.resume:
             if path.exists() or (self.output / _RESULT).exists():
@@ -131,17 +123,13 @@ class Search(EnvironmentOptions, Long):
         return result
 
     def interrupted(self) -> str:
-        """Nothing but a search that has begun is gone on with."""
+        """Return how to resume, if the search has begun."""
         begun = (self.output / _GENERATIONS).exists()
         return super().interrupted() if begun else "interrupted before the search began"
 
 
 def token_prices(env_id: str, options: dict[str, Any], task: Task, count: int) -> tuple[float, ...]:
-    """Prices over the task's price_range, evenly as logarithms; without one it is "auto".
-
-    Raises:
-        ConfigurationError: a plant without such prices.
-    """
+    """Return prices at even logarithmic distances over the task's price_range, or over "auto"."""
     span = task.reward.price.span
     if span is None:
         drawn = {"price_range": "auto", "cost_weight": "random"}
@@ -151,7 +139,7 @@ def token_prices(env_id: str, options: dict[str, Any], task: Task, count: int) -
 
 
 def result_table(env_id: str, result: SearchResult) -> Table:
-    """The costs of a searched rule beside the best single thresholds."""
+    """Return the table of the costs of a searched rule and of the best single thresholds."""
     columns = result.prices, result.costs, result.threshold_costs
     rows = [
         (f"{price:.4g}", f"{cost:.4g}", f"{single:.4g}", f"{cost / single - 1.0:+.1%}")

@@ -3,18 +3,19 @@
     fusion-gym train --config tobit_oscillator_ppo [--resume]
     fusion-gym train --env fusion_gym/LinearFusion-v2 --algorithm ppo --timesteps 200000
 
-Into the config's ``output`` folder go, as they are made: ``config.yaml``, ``latest.zip`` (the
-checkpoint), ``best_model.zip`` (best return on the validation seeds), ``validation.jsonl``,
-``tensorboard/`` and at the end ``final_model.zip`` and ``summary.json``.
+The config's ``output`` folder receives ``config.yaml``, ``latest.zip`` (the checkpoint),
+``best_model.zip`` (best return on the validation seeds), ``validation.jsonl`` and ``tensorboard/``,
+and at the end ``final_model.zip`` and ``summary.json``.
 
-Ctrl-C and SIGTERM end the training after the current rollout with a checkpoint (a second Ctrl-C
-at once, without one), and there is one after every validation. ``--resume`` goes on from the last
-as if nothing had happened: on one machine, with the same packages and threads, the models are
-bitwise those of an uninterrupted training. The config must be the same; ``timesteps`` may be more
-(schedules then stretch over all of them), ``output`` may have moved, ``threads`` may change.
+The command writes a checkpoint after every validation. Ctrl-C and SIGTERM end the training after
+the current rollout with a checkpoint; a second Ctrl-C ends it at once, without one. ``--resume``
+continues from the last checkpoint. On one machine, with the same packages and threads, the models
+are then bitwise equal to the models of an uninterrupted training. The config must be the same;
+``timesteps`` may grow (schedules then stretch over all of them), and ``output`` and ``threads`` may
+change.
 
-A checkpoint holds pickles and is loaded by Stable-Baselines3's own loader: resume trainings of your
-own alone, for a foreign folder runs whatever code is in it.
+A checkpoint contains pickles, and the loader of Stable-Baselines3 runs their code. Resume only your
+own trainings.
 """
 
 import re
@@ -41,26 +42,22 @@ class Train(Long):
     config: str | None = None
     """The experiment: a YAML file, or the name of a shipped config."""
     env: str | None = None
-    """Id of a registered environment, in the place of a config."""
+    """Id of a registered environment, instead of a config."""
     algorithm: str | None = None
-    """Algorithm for --env, with its defaults: ppo if none is given."""
+    """Algorithm for --env, with its default settings: ppo by default."""
     options: SetOptions = ()
-    """Options of gym.make for the environment; they go before the config's."""
+    """Options of gym.make for the environment; they override the options of the config."""
     timesteps: Steps = None
-    """Steps of all runs together, instead of the config's, or of a million with --env."""
+    """Steps of all runs together; by default the config's steps, or a million with --env."""
     seed: TrainingSeed = None
-    """Seed of the training, instead of the config's."""
+    """Seed of the training, instead of the config's seed."""
     output: Annotated[str | None, OutputFolder()] = None
-    """Folder for the results, instead of the config's."""
+    """Folder for the results, instead of the config's folder."""
     resume: bool = False
-    """Go on from the last checkpoint, one of your own: it holds pickles."""
+    """Continue from the last checkpoint; resume only your own, since it contains pickles."""
 
     def experiment(self) -> Experiment:
-        """The config with what the command line says instead, checked again.
-
-        Raises:
-            ConfigurationError: a config or a value that is not allowed.
-        """
+        """Return the config with the options of the command line, checked again."""
         return self._base_experiment().changed(
             self.output,
             parse_settings("option", list(chain(*self.options))),
@@ -69,7 +66,7 @@ class Train(Long):
         )
 
     def _base_experiment(self) -> Experiment:
-        """Return the config, or one of ``env`` and ``algorithm`` with defaults."""
+        """Return the config, or the default config of ``env`` and ``algorithm``."""
         if (self.config is None) == (self.env is None):
             raise ConfigurationError(
                 f"config = {self.config!r} is not allowed with env = {self.env!r}: give one of them"
@@ -92,14 +89,14 @@ class Train(Long):
         return parse(Experiment, content, "command line")
 
     def run(self) -> None:
-        """Train as far as the config says."""
+        """Train up to the number of steps in the config."""
         experiment = self.experiment()
         writable_folder("output", Path(experiment.output))
         if not train(experiment, resume=self.resume)["finished"]:
             raise KeyboardInterrupt
 
     def interrupted(self) -> str:
-        """Nothing but a training that has begun is gone on with."""
+        """Return how to resume, if the training has begun."""
         try:
             begun = holds_training(Path(self.experiment().output))
         except ConfigurationError:

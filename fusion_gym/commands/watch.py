@@ -1,10 +1,10 @@
-"""Watch one or two policies through an episode, in a window or as a film.
+r"""Watch one or two policies through an episode, in a window or as a film.
 
     fusion-gym watch --env fusion_gym/TobitOscillator-v1 --policy dynamic_event \\
         --against innovation_threshold:threshold=1 --save episode.gif
 
-Both meet the same noise, side by side and with the same axes: states and fused estimates with two
-claimed deviations, requests with their answers, tokens.
+Both policies meet the same noise. Their pictures stand side by side and share their axes: states
+and fused estimates with two claimed deviations, requests with their answers, tokens.
 """
 
 from collections.abc import Iterator
@@ -35,22 +35,18 @@ class Watch(EnvironmentOptions, Long):
     policy: Annotated[str, tyro.conf.arg(metavar="NAME[:key=value,…]")]
     """A rule or reference by name, zoo:NAME, model:PATH or module:Class."""
     against: Annotated[str | None, tyro.conf.arg(metavar="NAME[:key=value,…]")] = None
-    """Another policy beside it, on the same noise."""
+    """A second policy, on the same noise."""
     save: Annotated[Path | None, OutputFile(*ENDINGS)] = None
     """Write a film, .gif or .mp4, instead of showing a window."""
     seed: Seed = 0
     """Seed of the episode."""
     steps: Annotated[int | None, Whole(1)] = None
-    """Steps, instead of the whole episode."""
+    """Number of steps; the whole episode by default."""
     fps: Annotated[int, Whole(1, 50)] = 10
-    """Steps a second."""
+    """Steps per second."""
 
     def run(self) -> None:
-        """Show or save the episode.
-
-        Raises:
-            ConfigurationError: anything that is not allowed, before the first step.
-        """
+        """Show or save the episode."""
         if self.save is not None:
             require("save", "render", "imageio", "imageio_ffmpeg")
         env_id, options, _ = environment_of(self.env, self.config, self.options)
@@ -70,7 +66,7 @@ class Watch(EnvironmentOptions, Long):
             print(f"film in {self.save}")
 
     def interrupted(self) -> str:
-        """A film that is not finished is not kept."""
+        """Return the message after an interrupt, which leaves no film."""
         return "interrupted" if self.save is None else f"interrupted: no film in {self.save}"
 
     def _counted(self, frames: Iterator[Frame], task: Task) -> Iterator[Frame]:

@@ -1,4 +1,4 @@
-"""Several policies on the same episodes in one batch: for searches over many parameters."""
+"""Run several policies on the same episodes in one batch, for searches over many parameters."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -21,11 +21,13 @@ Runs = NDArray[np.int64]
 
 
 class Brief(NamedTuple):
-    """What a policy's E episodes brought, each averaged over its steps.
+    """The results of E episodes of a policy, each averaged over an episode's steps.
 
-    ``rate`` (E,) of transmissions, the mean over sensors · ``mse`` (E,), as in
-    :class:`~fusion_gym.evaluation.episodes.EpisodeResults`, and so are ``error_cost`` (E,) and
-    ``tokens`` (E,).
+    Args:
+        rate: transmissions (E,), the mean over the sensors.
+        mse: squared error (E,), as in :class:`~fusion_gym.evaluation.episodes.EpisodeResults`.
+        error_cost: error in the units of the reward (E,).
+        tokens: tokens spent (E,).
     """
 
     rate: Array
@@ -34,20 +36,26 @@ class Brief(NamedTuple):
     tokens: Array
 
     def cost(self, price: float | Array) -> Array:
-        """Return error + price · tokens (E,), at one price of a token or each episode's (E,)."""
+        """Return error + price · tokens (E,), for one price of a token or one per episode (E,)."""
         return self.error_cost + price * self.tokens
 
 
 def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int) -> list[Brief]:
-    """What ``run_episodes`` finds of each policy, up to rounding, in the time of one large batch.
+    """Run every policy on the seeds ``seed``, ``seed + 1``, … in one batch.
 
-    Every policy meets the noise of the seeds ``seed``, ``seed + 1``, …; a step's cost hardly
-    depends on the number of runs as long as that is some hundred.
+    The results equal the results of ``run_episodes`` up to rounding. The time of a step hardly
+    depends on the number of runs, up to some hundred runs.
+
+    Args:
+        task: the task.
+        policies: policies that use the beliefs of the same owner.
+        episodes: episodes of each policy, >= 1.
+        seed: seed of the first episode, >= 0.
 
     Raises:
-        ConfigurationError: no policies, policies that look at different owners' beliefs, fewer
-            than one episode, or a negative seed.
-        LookupError: a policy looks at a signal that the task withholds.
+        ConfigurationError: no policies, policies that use the beliefs of different owners, or a
+            value that is not allowed.
+        LookupError: a policy uses a signal that the task withholds.
     """
     validation.integer("episodes", episodes, at_least=1)
     validation.integer("seed", seed, at_least=0)
@@ -77,12 +85,18 @@ def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int)
 
 
 def run_priced(task: Task, policy: Policy, seeds: Runs, prices: Array) -> Brief:
-    """One policy in the episodes of N seeds side by side, each at its own price of a token (N,).
+    """Run one policy on N seeds, each at its own price of a token.
 
-    Its signals and the reward hold that price, whatever the task's is.
+    The signals and the reward use these prices instead of the price of the task.
+
+    Args:
+        task: the task.
+        policy: the policy.
+        seeds: seeds of the episodes (N,).
+        prices: price of a token in each episode (N,).
 
     Raises:
-        LookupError: the policy looks at a signal that the task withholds.
+        LookupError: the policy uses a signal that the task withholds.
     """
     batch = _batch(task, owner_of(policy), seeds)
     batch.price = np.array(prices, dtype=np.float64)
@@ -99,7 +113,7 @@ def _batch(task: Task, owner: Owner | None, seeds: Runs) -> EpisodeBatch:
 
 
 def _run(batch: EpisodeBatch, requests: Callable[[Signals], Requests]) -> Brief:
-    """The first episode of all runs of a batch."""
+    """Run the first episode of all runs of a batch."""
     sums, horizon = np.zeros((4, batch.num_envs)), batch.task.horizon
     for _ in range(horizon):
         outcome = batch.step(requests(batch.signals()))
@@ -111,14 +125,14 @@ def _run(batch: EpisodeBatch, requests: Callable[[Signals], Requests]) -> Brief:
 
 
 class _Whole:
-    """The signals of all runs, from which each policy takes those of its own."""
+    """The signals of all runs, divided among the policies."""
 
     def __init__(self, signals: Signals) -> None:
         self._signals = signals
         self._beliefs: dict[str, _Once] = {}
 
     def part(self, runs: Runs) -> Signals:
-        """The signals of some runs alone; nothing is computed before it is looked at."""
+        """Return the signals of some runs; each is computed at its first use."""
         values: dict[str, Callable[[], Any]] = {
             name: partial(self._take, name, runs) for name in self._signals
         }
@@ -148,7 +162,7 @@ class _Once:
 
 
 class _Part(Beliefs):
-    """The beliefs of some runs alone."""
+    """The beliefs of some runs."""
 
     def __init__(self, whole: _Once, runs: Runs) -> None:
         self.task, self.memory_states = whole.beliefs.task, whole.beliefs.memory_states

@@ -1,12 +1,12 @@
-"""Whether the distance to the best estimate can stand for the error: the term that tells.
+"""Measure the cross term between the mismatch and the floor of the error.
 
-With x̂ the centre's estimate, and x* that of a filter which takes in every measurement,
+With x̂ the centre's estimate and x* the estimate of a filter that processes every measurement,
 
     E‖x - x̂‖² = E‖x - x*‖² + E‖x* - x̂‖² + 2 E⟨x - x*, x* - x̂⟩,
 
-in the reward's weights: error, floor, mismatch, cross term. The cross term is zero for every policy
-if x* is the conditional mean given all that x̂ and the policy use. Where x* is an approximation it
-is not, and a policy that is trained on the mismatch is drawn aside by it.
+in the weights of the reward: error, floor, mismatch, cross term. The cross term is zero for every
+policy if x* is the conditional mean given all that x̂ and the policy use. If x* is an
+approximation, the cross term need not be zero, and training on the mismatch is biased.
 """
 
 import math
@@ -26,10 +26,14 @@ from fusion_gym.policies.base import Policy, owner_of, refused_signals
 
 
 class CrossTerm(NamedTuple):
-    """What a policy's episodes show of the error's parts, each a mean over steps and episodes.
+    """The parts of a policy's error, each a mean over steps and episodes.
 
-    ``rate`` of transmissions a sensor and step; ``error``, ``floor`` and ``mismatch`` in the
-    reward's weights, scaled to a mean of 1; ``share`` of the cross term in the error.
+    Args:
+        rate: transmissions per sensor and step.
+        error: squared error in the weights of the reward, scaled to a mean of 1.
+        floor: the part E‖x - x*‖², in the same weights.
+        mismatch: the part E‖x* - x̂‖², in the same weights.
+        share: share of the cross term in the error, with its interval.
     """
 
     rate: float
@@ -40,7 +44,7 @@ class CrossTerm(NamedTuple):
 
     @property
     def compatible(self) -> bool:
-        """Whether the cross term may be zero."""
+        """Whether the interval of the share contains zero."""
         return self.share.low <= 0.0 <= self.share.high
 
     @property
@@ -57,15 +61,22 @@ def cross_terms(
     seed: int,
     level: float = LEVEL,
 ) -> dict[str, CrossTerm]:
-    """The cross term under each policy, in episodes with the seeds ``seed``, ``seed + 1``, …
+    """Estimate the cross term under each policy, on the seeds ``seed``, ``seed + 1``, …
 
-    ``reference`` is the system, on the same noise, whose filter takes in every measurement
-    (:func:`~fusion_gym.envs.privileged.reference_system`). All intervals hold together with the
-    probability ``level`` (Bonferroni): where some exclude zero, it is not for their number.
+    All intervals hold together with the probability ``level`` (Bonferroni).
+
+    Args:
+        task: the task.
+        reference: the system whose filter processes every measurement, on the same noise
+            (:func:`~fusion_gym.envs.privileged.reference_system`).
+        policies: policies by name.
+        episodes: episodes of each policy, >= 2.
+        seed: seed of the first episode, >= 0.
+        level: joint confidence level of all intervals.
 
     Raises:
         ConfigurationError: fewer than two episodes, which have no interval, or a negative seed.
-        LookupError: a policy looks at a signal that the task withholds.
+        LookupError: a policy uses a signal that the task withholds.
     """
     validation.integer("episodes", episodes, at_least=2)
     validation.integer("seed", seed, at_least=0)
@@ -79,17 +90,12 @@ def cross_terms(
 
 
 def worst(terms: Mapping[str, CrossTerm]) -> tuple[str, CrossTerm]:
-    """The policy with the largest cross term, of those whose may not be zero if there are some."""
+    """Return the policy of the largest cross term, with significant cross terms first."""
     return max(terms.items(), key=lambda item: (not item[1].compatible, abs(item[1].share.mean)))
 
 
 def usual_policies(task: Task, rate: float) -> list[str]:
-    """Two different policies that every environment knows, as texts for ``make_policy``.
-
-    Random requests at a rate, which choose by nothing. And the value of a transmission against the
-    price of a token (the middle of a range), which is what an agent comes to look like; where a
-    policy may not look at new measurements, every request.
-    """
+    """Return the texts of two policies that exist in every environment."""
     random = f"random:rate={rate:.4g}"
     if task.information != "sensors":
         return [random, "always"]
@@ -104,7 +110,7 @@ def usual_policies(task: Task, rate: float) -> list[str]:
 def _run(
     task: Task, system: System[Any], policy: Policy, episodes: int, seed: int,
 ) -> Array:  # fmt: skip
-    """Rate, error, floor and mismatch (4, E) of episodes, each a mean over steps."""
+    """Return rate, error, floor and mismatch (4, E) of episodes, each a mean over steps."""
     batch = EpisodeBatch(task, episodes, owner_of(policy), system)
     batch.seed(np.arange(episodes), [seed + place for place in range(episodes)])
     batch.reset()
@@ -120,7 +126,7 @@ def _run(
 
 
 def _summary(parts: Array, level: float) -> CrossTerm:
-    """Means, and the share as a ratio of means, whose interval is that of its linear part."""
+    """Return the means and the share, a ratio of means with the interval of its linearisation."""
     rate, error, floor, mismatch = parts
     cross, total = error - floor - mismatch, float(error.mean())
     if total == 0.0:

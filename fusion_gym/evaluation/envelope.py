@@ -14,7 +14,18 @@ FAR_APART = 1.5
 
 
 class EnvelopePoint(NamedTuple):
-    """A policy on the envelope: its name, mean rate per sensor and step, mean squared error."""
+    """A policy on the envelope, with its means over episodes.
+
+    Args:
+        name: name of the policy.
+        rate: transmissions per sensor and step.
+        mse: squared error per step, summed over states, in squared units of the states.
+
+    Example:
+        >>> from fusion_gym.evaluation import EnvelopePoint
+        >>> EnvelopePoint("always", 0.55, 0.106).rate
+        0.55
+    """
 
     name: str
     rate: float
@@ -22,7 +33,7 @@ class EnvelopePoint(NamedTuple):
 
 
 def points_of(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
-    """Each policy's mean rate and error, by rising rate (of equal ones: by rising error)."""
+    """Return the mean rate and error of each policy, sorted by rate, then by error."""
     points = [
         EnvelopePoint(name, float(r.rate.mean()), float(r.mse.mean()))
         for name, r in results.items()
@@ -31,24 +42,34 @@ def points_of(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
 
 
 def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
-    """The lower convex hull of the policies' points, by rising rate and strictly falling error.
+    """Return the lower convex hull of the policies' points (rate, MSE).
 
-    Every point between two policies is reached by drawing one of them for each episode, and
-    every point to the right of one by that one itself; so nothing that the policies offer,
-    mixtures included, lies below the envelope.
+    A random choice between two policies for each episode reaches every point of the line between
+    them. No policy and no mixture of policies lies below the hull.
+
+    Args:
+        results: results of each policy by name.
+
+    Returns:
+        The points of the hull, by rising rate and strictly falling error.
 
     Raises:
-        ConfigurationError: there are no policies.
+        ConfigurationError: no policies.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import lower_envelope, run_episodes
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> names = ["never", "periodic:period=4", "always"]
+        >>> results = {n: run_episodes(task, make_policy(n, task), 8, seed=0) for n in names}
+        >>> [(point.name, round(point.rate, 2)) for point in lower_envelope(results)]
+        [('never', 0.0), ('periodic:period=4', 0.25), ('always', 0.55)]
     """
     return lower_hull(points_of(results))
 
 
 def lower_hull(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
-    """The points of :func:`lower_envelope`, of points in any order.
-
-    Raises:
-        ConfigurationError: there are none.
-    """
+    """Return the lower convex hull of points in any order."""
     ordered = sorted(points, key=lambda point: (point.rate, point.mse, point.name))
     if not ordered:
         raise ConfigurationError("policies = {} is not allowed: an envelope needs at least one")
@@ -63,16 +84,13 @@ def lower_hull(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
 
 
 def _above(left: EnvelopePoint, middle: EnvelopePoint, right: EnvelopePoint) -> bool:
-    """Whether ``middle`` lies on or above the line from ``left`` to ``right``."""
+    """Return whether ``middle`` lies on or above the line from ``left`` to ``right``."""
     rise = (middle.mse - left.mse) * (right.rate - left.rate)
     return rise >= (right.mse - left.mse) * (middle.rate - left.rate)
 
 
 def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | None:
-    """The policies of an envelope, by rising rate, and their shares at a rate.
-
-    ``None`` left of it; right of it the last policy alone.
-    """
+    """Return the shares of policies of an envelope at a rate; ``None`` to the left of it."""
     if rate < hull[0].rate:
         return None
     left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)
@@ -88,11 +106,14 @@ def _mixed(results: Mapping[str, EpisodeResults], shares: Mapping[str, float]) -
 
 
 class BaselineComparison(NamedTuple):
-    """A policy against the envelope at its own rate, over paired episodes.
+    """A policy against the envelope at the policy's rate, over paired episodes.
 
-    ``difference`` is the policy's MSE minus the envelope's, ``envelope`` the envelope's MSE,
-    ``between`` the policies that were mixed. ``far_apart`` says that their rates differ by more
-    than ``FAR_APART`` times: a rule between them would lie below the line.
+    Args:
+        difference: MSE of the policy minus MSE of the envelope, with its interval.
+        envelope: MSE of the envelope at this rate.
+        between: the policies of the mixture.
+        far_apart: whether their rates differ by more than the factor ``FAR_APART``; a policy with a
+            rate between them may lie below the line.
     """
 
     difference: Interval
@@ -104,11 +125,30 @@ class BaselineComparison(NamedTuple):
 def compare_with_envelope(
     results: EpisodeResults, baselines: Mapping[str, EpisodeResults]
 ) -> BaselineComparison:
-    """Paired difference of the MSE to the baselines' lower envelope at the policy's own rate.
+    """Return the paired difference of the MSE to the baselines' lower envelope.
+
+    The envelope is taken at the mean rate of the policy. Negative: the policy is better.
+
+    Args:
+        results: results of the policy.
+        baselines: results of the baselines by name, on the same episodes.
+
+    Returns:
+        The difference with its interval, the envelope's MSE and the mixed policies.
 
     Raises:
-        ConfigurationError: no baselines, other numbers of episodes, or a rate below every
-            baseline's (there the envelope does not exist).
+        ConfigurationError: no baselines, another number of episodes, or a rate below the rates of
+            all baselines.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import compare_with_envelope, run_episodes
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> names = ["never", "always", "periodic:period=8"]
+        >>> results = {n: run_episodes(task, make_policy(n, task), 8, seed=0) for n in names}
+        >>> comparison = compare_with_envelope(results.pop("periodic:period=8"), results)
+        >>> round(comparison.difference.mean, 3), comparison.between
+        (-0.011, ('never', 'always'))
     """
     _check_pairs(results, baselines)
     hull = lower_envelope(baselines)
@@ -133,8 +173,12 @@ def compare_with_envelope(
 class PriceComparison(NamedTuple):
     """A policy against the best baseline at one price of a token, over paired episodes.
 
-    ``difference`` is the policy's cost minus the cost of the baseline ``best``, in the mean
-    ``cost``. Negative: the policy is better.
+    Args:
+        price: price of a token.
+        best: name of the best baseline.
+        cost: mean cost of the best baseline per step.
+        difference: cost of the policy minus ``cost``, with its interval; negative: the policy is
+            better.
     """
 
     price: float
@@ -151,12 +195,18 @@ class PriceComparison(NamedTuple):
 def compare_at_price(
     results: EpisodeResults, baselines: Mapping[str, EpisodeResults], price: float
 ) -> PriceComparison:
-    """Return the paired difference of cost = error + price · tokens, a step, to the best baseline.
+    """Return the paired difference of the cost per step to the best baseline.
 
-    The baseline of the least mean on these episodes, which favours the baselines.
+    The cost is error + price · tokens. The best baseline has the least mean cost on these episodes;
+    this choice favours the baselines.
+
+    Args:
+        results: results of the policy.
+        baselines: results of the baselines by name, on the same episodes.
+        price: price of a token.
 
     Raises:
-        ConfigurationError: no baselines, or other numbers of episodes.
+        ConfigurationError: no baselines, or another number of episodes.
     """
     _check_pairs(results, baselines)
     costs = {name: item.error_cost + price * item.tokens for name, item in baselines.items()}

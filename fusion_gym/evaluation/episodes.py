@@ -1,4 +1,4 @@
-"""Running a policy over episodes whose noise is fixed by their seeds."""
+"""Run a policy over episodes whose noise is fixed by their seeds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -14,20 +14,34 @@ from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import orthonormalise
 from fusion_gym.policies.base import Policy, owner_of, refused_signals
 
-BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
+BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on the machine
 
 
 @dataclass(frozen=True)
 class EpisodeResults:
-    """What E episodes of horizon H brought, each entry averaged over an episode's steps.
+    """The results of E episodes of H steps; most fields are averages over an episode's steps.
 
-    ``mse`` (E,) squared error of the fused estimate, summed over states · ``error_cost`` (E,) the
-    error as the reward counts it, >= 0 · ``bound_trace`` (E,) trace of the claimed covariance ·
-    ``nees`` (E,) normalised squared error divided by the number of directions with a variance, 1
-    for a consistent filter · ``rate`` and ``requests`` (E, sensors) · ``tokens`` (E,) spent and
-    ``denied`` (E,) requests refused, per step ·
-    ``returns`` (E,) sum of the rewards · ``diverged`` (E,) share of diverged steps ·
-    ``squared_error`` (H, n), the mean over episodes at each time and state.
+    Args:
+        mse: squared error of the fused estimate (E,), summed over states.
+        error_cost: error in the units of the reward (E,), >= 0.
+        bound_trace: trace of the claimed covariance (E,).
+        nees: normalised squared error (E,), divided by the rank of the covariance; 1 for a
+            consistent filter.
+        rate: transmissions (E, sensors).
+        requests: requests (E, sensors).
+        tokens: tokens spent (E,).
+        denied: requests that the network refused (E,), summed over sensors.
+        returns: sum of the rewards (E,).
+        diverged: share of diverged steps (E,).
+        squared_error: squared error (H, n) at each time and state, averaged over episodes.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import run_episodes
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> results = run_episodes(task, make_policy("always", task), episodes=4, seed=0)
+        >>> results.episodes, results.rate.shape, results.squared_error.shape
+        (4, (4, 3), (20, 2))
     """
 
     mse: Array
@@ -44,7 +58,7 @@ class EpisodeResults:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes."""
+        """Number of episodes E."""
         return len(self.mse)
 
 
@@ -55,13 +69,31 @@ def run_episodes(
     seed: int,
     progress: Callable[[int], Any] | None = None,
 ) -> EpisodeResults:
-    """Run episodes with the seeds ``seed``, ``seed + 1``, …; the same seed is the same noise.
+    """Run a policy on the episodes of the seeds ``seed``, ``seed + 1``, …
 
-    ``progress`` is called with the number of environment steps made since its last call.
+    The same seed gives the same noise, so the results of two policies are paired.
+
+    Args:
+        task: the task.
+        policy: the policy, for example of :func:`~fusion_gym.make_policy`.
+        episodes: number of episodes, >= 1.
+        seed: seed of the first episode, >= 0.
+        progress: function that receives the number of environment steps since its last call.
+
+    Returns:
+        The results, with the episodes in the order of their seeds.
 
     Raises:
         ConfigurationError: fewer than one episode, or a negative seed.
-        LookupError: the policy looks at a signal that the task withholds.
+        LookupError: the policy uses a signal that the task withholds.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import run_episodes
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> results = run_episodes(task, make_policy("periodic:period=4", task), 4, seed=0)
+        >>> round(float(results.rate.mean()), 2)
+        0.25
     """
     validation.integer("episodes", episodes, at_least=1)
     validation.integer("seed", seed, at_least=0)
@@ -80,7 +112,7 @@ def run_episodes(
 
 
 def _normalised_error(error: Array, covariance: Array) -> Array:
-    """Return eᵀ P⁺ e over the rank of P (N,): directions without a variance do not count."""
+    """Return eᵀ P⁺ e over the rank of P (N,)."""
     result = linalg.dot(error, linalg.solve_vector(covariance, error)) / len(error)
     lanes = np.flatnonzero(np.isnan(result) & np.isfinite(covariance).all((0, 1)))
     if lanes.size:
@@ -137,11 +169,23 @@ def _run_batch(
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One episode, times 1..H first.
+    """One episode of H steps, at the times 1..H.
 
-    ``truth`` and ``mean`` (H, n) · ``variance`` (H, n), the diagonal of the claimed covariance ·
-    ``local_mean`` (H, sensors, n), before the feedback · ``tokens`` (H,) after each step ·
-    ``requested`` and ``granted`` (H, sensors) bool.
+    Args:
+        truth: true state (H, n).
+        mean: fused estimate (H, n).
+        variance: diagonal of the claimed covariance (H, n).
+        local_mean: local estimates (H, sensors, n), before the feedback.
+        tokens: tokens after each step (H,).
+        requested: requests (H, sensors), bool.
+        granted: grants (H, sensors), bool.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import record_episode
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> record_episode(task, make_policy("always", task), seed=0).local_mean.shape
+        (20, 3, 2)
     """
 
     truth: Array
@@ -154,11 +198,27 @@ class Trajectory:
 
 
 def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
-    """Everything about the episode with this seed, for figures.
+    """Return states, estimates, requests and tokens of the episode with this seed.
+
+    Args:
+        task: the task.
+        policy: the policy.
+        seed: seed of the episode, >= 0.
+
+    Returns:
+        The trajectory, with the time as its first axis.
 
     Raises:
         ConfigurationError: a negative seed.
-        LookupError: the policy looks at a signal that the task withholds.
+        LookupError: the policy uses a signal that the task withholds.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import record_episode
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> trajectory = record_episode(task, make_policy("never", task), seed=0)
+        >>> trajectory.truth.shape, int(trajectory.granted.sum())
+        ((20, 2), 0)
     """
     validation.integer("seed", seed, at_least=0)
     batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))

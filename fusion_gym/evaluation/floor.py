@@ -1,4 +1,4 @@
-"""What the error is where everything is always taken in."""
+"""The error of a centre that receives every measurement."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,12 +18,17 @@ def everything_delivered(
     episodes: int = 1000,
     seed: int = 0,
 ) -> dict[str, Interval]:
-    """The MSE of a centre that gets every measurement, by filter, with its 95 % interval.
+    """Return the MSE of a centre that receives every measurement, by filter, with its interval.
 
-    The environment's tokens and access are opened; ``filters`` are values of its option
-    ``filter``, by default the setting's own. The best of them is what no rule is likely to
-    undercut with these filters. It is no bound: these filters may be approximations, and with
-    one, less may be more.
+    Tokens and access are unlimited. The least of these errors is no bound: a filter may be an
+    approximation, for which fewer measurements can be better.
+
+    Args:
+        env_id: id of the environment.
+        options: options of the environment.
+        filters: values of the option ``filter``; the filter of ``options`` by default.
+        episodes: episodes of each filter.
+        seed: seed of the first episode.
 
     Raises:
         ConfigurationError: a value that is not allowed.
@@ -35,15 +40,11 @@ def everything_delivered(
 
 
 def _tasks(env_id: str, options: Mapping[str, Any], filters: Sequence[str] = ()) -> dict[str, Task]:
-    """The environment with tokens and access opened, by filter.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
+    """Return the tasks with unlimited tokens and access, by filter."""
     open_wide = {**options, "tokens": "unlimited", "access": "any"}
     if not filters:
         return {"own": make_task(env_id, **open_wide)}
-    make_task(env_id, **open_wide)  # what is wrong without a filter is not for its sake
+    make_task(env_id, **open_wide)  # reports an error that no filter causes
     tasks = {}
     for name in filters:
         try:

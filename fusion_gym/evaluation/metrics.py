@@ -1,4 +1,4 @@
-"""From episodes to the numbers of a report."""
+"""Compute the metrics of a report from episodes."""
 
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
@@ -13,12 +13,17 @@ from fusion_gym.validation import ConfigurationError
 
 
 class Metric(NamedTuple):
-    """A row of the table: its meaning, which values are ``better``, and its ``samples``.
+    """A metric of an evaluation: a row of the table of metrics.
 
-    Samples are by default the field of :class:`EpisodeResults` of its name. Of samples (E,) a
-    summary has the mean with its 95 % bootstrap interval over episodes, of an array with a column
-    for each ``axis`` the means. ``column`` heads it in printed tables, where ``form`` writes the
-    mean, and ``interval`` adds the half width.
+    Args:
+        meaning: its meaning, in a few words.
+        better: values that are better.
+        axis: axis of one value each; without one the summary is a mean with its 95 % interval.
+        column: head of its column in printed tables; empty for none.
+        form: format of its mean in printed tables.
+        interval: whether printed tables show the half width of its interval.
+        samples: function from results to samples (E,) or (E, axis); the field of
+            :class:`EpisodeResults` with the name of the metric by default.
     """
 
     meaning: str
@@ -30,7 +35,7 @@ class Metric(NamedTuple):
     samples: Callable[[EpisodeResults], Array] | None = None
 
     def summary(self, name: str, results: EpisodeResults) -> Any:
-        """Return what a summary has of it: an interval, or a list along its axis."""
+        """Return the metric's interval, or its means along its axis."""
         result = self.samples(results) if self.samples else getattr(results, name)
         return result.mean(0).tolist() if self.axis else mean_interval(result)._asdict()
 
@@ -60,9 +65,22 @@ METRICS = {
 
 
 def summarise(results: EpisodeResults) -> dict[str, Any]:
-    """Return every metric of ``METRICS`` for one policy, as the evaluation's JSON holds it.
+    """Return every metric of one policy, as in the JSON of an evaluation.
 
-    ``{"mean", "low", "high"}``, or a list with one number a sensor or a state.
+    Args:
+        results: results of the policy.
+
+    Returns:
+        By metric a table ``{"mean", "low", "high"}``, or a list with one number per sensor or
+        state.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import run_episodes, summarise
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> results = run_episodes(task, make_policy("periodic:period=8", task), 8, seed=0)
+        >>> summarise(results)["rate"]
+        [0.15, 0.15, 0.1]
     """
     return {name: metric.summary(name, results) for name, metric in METRICS.items()}
 
@@ -77,10 +95,24 @@ def metric_table(_: str) -> str:
 
 
 def robust_summary(results: EpisodeResults) -> dict[str, float]:
-    """What a few divergent episodes cannot spoil: quantiles of the episodes' MSE.
+    """Return quantiles of the episodes' MSE, which a few divergent episodes hardly change.
 
-    ``q05``, ``q25``, ``median``, ``q75``, ``q95`` and ``diverged``, the share of steps in which
-    some state's squared error was above 100 times its open-loop mean, or not finite.
+    A step counts as diverged if the squared error of a state exceeds 100 times its open-loop mean,
+    or is not finite.
+
+    Args:
+        results: results of the policy.
+
+    Returns:
+        The quantiles ``q05``, ``q25``, ``median``, ``q75`` and ``q95``, and the share ``diverged``
+        of diverged steps.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import robust_summary, run_episodes
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> robust_summary(run_episodes(task, make_policy("always", task), 4, seed=0))["diverged"]
+        0.0
     """
     names = {"q05": 0.05, "q25": 0.25, "median": 0.5, "q75": 0.75, "q95": 0.95}
     quantiles = {name: float(np.quantile(results.mse, level)) for name, level in names.items()}
@@ -88,10 +120,26 @@ def robust_summary(results: EpisodeResults) -> dict[str, float]:
 
 
 def paired_difference(results: EpisodeResults, reference: EpisodeResults) -> Interval:
-    """Mean difference of the MSE to a reference over the same seeds, with its 95 % interval.
+    """Return the mean difference of the MSE to a reference, with its 95 % interval.
+
+    Args:
+        results: results of the policy.
+        reference: results of the reference, on the same seeds.
+
+    Returns:
+        The interval of ``results.mse - reference.mse``; negative: the policy is better.
 
     Raises:
-        ConfigurationError: the two have different numbers of episodes.
+        ConfigurationError: the numbers of episodes differ.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import paired_difference, run_episodes
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> always = run_episodes(task, make_policy("always", task), 8, seed=0)
+        >>> never = run_episodes(task, make_policy("never", task), 8, seed=0)
+        >>> round(paired_difference(always, never).mean, 3)
+        -0.07
     """
     if results.episodes != reference.episodes:
         raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""Whether an ONNX file decides as the agent that it was made of, and how long it takes."""
+"""Compare an ONNX file with its agent, and measure its latency."""
 
 import importlib
 import math
@@ -19,16 +19,22 @@ from fusion_gym.policies.onnx_graph import DecisionGraph
 
 OBSERVATIONS = 10_000
 TOLERANCE = 1e-4  # of numbers, relative to 1 + their size; float32 leaves about 1e-6
-_SEED = 700_000_000  # of the first episode: none that trains, tunes or tests
-_CALLS, _WARM = 5000, 200  # that latency is measured over, and before it
+_SEED = 700_000_000  # of the first episode; no training, tuning or test uses it
+_CALLS, _WARM = 5000, 200  # measured calls, and calls before them
 
 Values = dict[str, NDArray[Any]]
 
 
 class Agreement(NamedTuple):
-    """Of so many ``observations`` of so many ``episodes`` the graph decides ``different`` ones
-    otherwise; ``difference`` is the greatest of its other outputs' from the agent's, and
-    ``relative`` the greatest of it over 1 + their size."""
+    """The agreement of an ONNX graph with its agent.
+
+    Args:
+        observations: number of compared observations.
+        episodes: number of their episodes.
+        different: number of observations with another decision.
+        difference: greatest difference of the other outputs.
+        relative: greatest difference over 1 + the size of the output.
+    """
 
     observations: int
     episodes: int
@@ -38,19 +44,19 @@ class Agreement(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether all decisions agree, and all numbers up to rounding."""
+        """Whether all decisions agree, and all other outputs up to ``TOLERANCE``."""
         return self.different == 0 and self.relative <= TOLERANCE
 
 
 class Latency(NamedTuple):
-    """Seconds of one call with one row on one thread: the ``median``, and what 99 % stay below."""
+    """Seconds of one call with one row on one thread: ``median``, and ``most``, the 99 % point."""
 
     median: float
     most: float
 
 
 def session(path: Path) -> Any:
-    """An onnxruntime session on one thread of the processor, as a node has it."""
+    """Return an onnxruntime session on one thread of the processor."""
     onnxruntime: Any = importlib.import_module("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -65,10 +71,18 @@ def onnx_agreement(
     observations: int = OBSERVATIONS,
     seed: int = _SEED,
 ) -> Agreement:
-    """Play whole episodes with the agent and ask the file at ``path`` beside it, step by step.
+    """Compare the ONNX file at ``path`` with its agent in whole episodes.
 
-    As many episodes as it takes for that many observations, a row each. Decisions are compared
-    with those of Stable-Baselines3, all else with ``graph`` in torch.
+    Decisions are compared with the decisions of Stable-Baselines3, all other outputs with ``graph``
+    in torch.
+
+    Args:
+        agent: the agent.
+        graph: the graph of the file.
+        path: the ONNX file.
+        task: the task of the episodes.
+        observations: least number of observations, one row each.
+        seed: seed of the first episode.
     """
     rows = task.horizon * agent.view.rows_per_run
     episodes = math.ceil(observations / rows)
@@ -80,7 +94,7 @@ def onnx_agreement(
 
 
 def latency(graph: DecisionGraph, path: Path) -> Latency:
-    """How long the file at ``path`` takes for one row, by many calls one after another."""
+    """Measure the time of one decision of the file at ``path``, over many calls in sequence."""
     run = session(path)
     arguments = {
         name: value.numpy() for name, value in zip(graph.inputs, graph.example(1), strict=True)
@@ -95,7 +109,7 @@ def latency(graph: DecisionGraph, path: Path) -> Latency:
 
 
 class _Beside:
-    """The agent as a policy; whatever it is asked the ONNX session is asked as well."""
+    """The agent as a policy that also runs the ONNX session on every observation."""
 
     def __init__(self, agent: ModelPolicy, graph: DecisionGraph, run: Any) -> None:
         self.knowledge: Knowledge = agent.knowledge
@@ -105,7 +119,7 @@ class _Beside:
         self.different, self.difference, self.relative = 0, 0.0, 0.0
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget what was remembered."""
+        """Clear the memory."""
         self._agent.reset(runs, seed)
         start = self._graph.example(runs * self._agent.view.rows_per_run)
         values = dict(zip(self._graph.inputs, (item.numpy() for item in start), strict=True))
@@ -113,7 +127,7 @@ class _Beside:
         self._memories = [memory, memory]
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N) of the agent."""
+        """Return the agent's requests (sensors, N)."""
         request: Values = {"observation": self._agent.rows(signals)[:, self._columns]}
         if "grantable" in self._graph.inputs:
             request["grantable"] = signals["grantable"].T.reshape(len(request["observation"]), -1)
@@ -144,7 +158,7 @@ class _Beside:
 
 
 def _following(outputs: Values) -> Values:
-    """The memory for the next step."""
+    """Return the memory for the next step."""
     return {
         name.removesuffix("_next"): value
         for name, value in outputs.items()

@@ -1,4 +1,4 @@
-"""An agent as an ONNX file, written, checked and timed."""
+"""Write, check and time an agent as an ONNX file."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,8 +14,15 @@ from fusion_gym.validation import ConfigurationError, refusal
 
 
 class Exported(NamedTuple):
-    """What was written: ``size`` in bytes, names and shapes of what goes in and comes out, how it
-    agrees with the agent, and what a decision takes."""
+    """A written ONNX file.
+
+    Args:
+        size: bytes.
+        inputs: shapes of the inputs by name.
+        outputs: shapes of the outputs by name.
+        agreement: comparison with the agent.
+        latency: time of a decision.
+    """
 
     size: int
     inputs: Shapes
@@ -27,16 +34,22 @@ class Exported(NamedTuple):
 def export_onnx(
     agent: Policy, task: Task, path: str | Path, environment: str, model: str = ""
 ) -> Exported:
-    """Write an agent that ``make_policy`` made for this task as an ONNX file, and check it.
+    """Write an agent as an ONNX file, and check it.
 
-    ``environment`` is the id that the task was made of, ``model`` how the agent is called; both
-    stand in the file. Its graph is :class:`~fusion_gym.policies.onnx_graph.DecisionGraph`, its
-    metadata :func:`~fusion_gym.policies.onnx_card.onnx_card`.
+    The graph is :class:`~fusion_gym.policies.onnx_graph.DecisionGraph`; the metadata are
+    :func:`~fusion_gym.policies.onnx_card.onnx_card`. A file that decides otherwise than the agent
+    is removed.
+
+    Args:
+        agent: a saved agent that ``make_policy`` made for this task.
+        task: the task.
+        path: the file to write.
+        environment: id of the environment of the task, for the metadata.
+        model: name of the agent, for the metadata.
 
     Raises:
-        ConfigurationError: no saved agent, one whose policy cannot be written or that decides by
-            chance, ONNX is not installed, or a file that decides otherwise than the agent on some
-            of at least 10,000 observations, which is removed.
+        ConfigurationError: no saved agent, a policy that cannot be written or that draws its
+            actions, missing packages, or decisions that differ in at least 10,000 observations.
         OSError: the file cannot be written.
     """
     require("onnx", "onnx", "onnx", "onnxruntime")

@@ -1,15 +1,15 @@
-"""CMA-ES over the numbers of the rule ``priced_threshold``, for one task at several prices at once.
+"""Search the numbers of the rule ``priced_threshold`` for several prices at once, by CMA-ES.
 
     search = search_of_class("scheduler", task, prices=(0.003, 0.01, 0.03, 0.1))
     result = search_rule(search)
     policy = make_policy(result.policy, task)
 
-It begins with the best one-threshold rule of the same score: of a sweep, the best threshold at each
-price, and the power of the price that fits them. Every generation meets fresh episodes, more from
-one to the next, and the result is the mean of the second half of the generations' means. All
-candidates, prices and episodes of a generation run side by side. Source: N. Hansen and
-A. Ostermeier, "Completely derandomized self-adaptation in evolution strategies", Evolutionary
-Computation 9, 2001, as in the package cmaes.
+The search starts with the best single threshold at each price, and the power of the price that fits
+these thresholds. Every generation uses fresh episodes, and their number grows. The result is the
+mean of the means of the second half of the generations.
+
+Source: N. Hansen and A. Ostermeier, "Completely derandomized self-adaptation in evolution
+strategies", Evolutionary Computation 9, 2001, as in the package cmaes.
 """
 
 import functools
@@ -35,7 +35,7 @@ _SCORES: dict[ClassName, tuple[Score, ...]] = {
     "local": ("value", "innovation"),
     "scheduler": ("value",),
 }
-_RUNS = 2048  # beside each other; fixed, so that results do not depend on the machine
+_RUNS = 2048  # in one batch; fixed, so that results do not depend on the machine
 _WIDE = 20.0  # a margin that hardly ever lets two sensors transmit in the same step
 _WORST = 1e30  # the cost of a candidate whose error is no number
 # Each coordinate's first standard deviation and limits; threshold and margin as logarithms.
@@ -52,7 +52,7 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class ThresholdTrial:
-    """A rule with a threshold: its tokens and its error a step, means over episodes."""
+    """A rule with a threshold: its tokens and its error per step, means over episodes."""
 
     policy: str
     threshold: float
@@ -66,10 +66,14 @@ class ThresholdTrial:
 
 @dataclass(frozen=True)
 class Generation:
-    """One generation: its number from 0, each candidate's objective, and the mean that follows.
+    """One generation of the search.
 
-    The ``mean`` is in the coordinates of the search. As JSON it is ``dataclasses.asdict``, back
-    ``Generation(**value)``.
+    Its JSON is ``dataclasses.asdict``, and ``Generation(**value)`` restores it.
+
+    Args:
+        number: its number, from 0.
+        objectives: objective of each candidate.
+        mean: mean of the distribution after it, in the coordinates of the search.
     """
 
     number: int
@@ -79,10 +83,13 @@ class Generation:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The policy as a line of text, its costs, and the costs of the best single thresholds.
+    """The result of a search.
 
-    ``costs`` and ``threshold_costs`` stand in the order of ``prices`` and are means over the same
-    fresh episodes.
+    Args:
+        policy: the rule as text.
+        prices: prices of a token.
+        costs: cost of the rule at each price, on fresh episodes.
+        threshold_costs: cost of the best single threshold at each price, on the same episodes.
     """
 
     policy: str
@@ -98,12 +105,18 @@ class SearchResult:
 
 @dataclass(frozen=True)
 class RuleSearch:
-    """A search: the task, the ``prices`` of a token, whose beliefs (``own``) and which ``score``.
+    """A search of one rule for all prices.
 
-    ``bounds`` are the least and the largest threshold of the sweep at the start, None for those
-    that the prices suggest. A generation has ``population`` candidates and meets ``episodes``
-    episodes, from the first number to the last; ``seed`` is the first episode's and the
-    candidates'.
+    Args:
+        task: the task.
+        prices: prices of a token, > 0 and different.
+        own: whether every sensor decides locally.
+        score: score of the rule, as in :class:`PricedThreshold`.
+        bounds: least and largest threshold of the first sweep; derived from the prices by default.
+        generations: number of generations.
+        population: candidates of a generation, >= 3.
+        episodes: episodes of the first and of the last generation.
+        seed: seed of the first episode and of the candidates.
 
     Raises:
         ConfigurationError: a value that is not allowed.
@@ -131,7 +144,7 @@ class RuleSearch:
 
     @property
     def text(self) -> str:
-        """The policy without its numbers."""
+        """The text of the policy without its numbers."""
         return f"priced_threshold:own={str(self.own).lower()},score={self.score}"
 
     @property
@@ -141,7 +154,7 @@ class RuleSearch:
 
     @functools.cached_property
     def coordinates(self) -> tuple[str, ...]:
-        """The number that each coordinate sets; sensors follow one another."""
+        """The name of the number of each coordinate; the sensors follow one another."""
         task = self.task
         per_sensor = ["threshold", "price_exponent"] if len(self.prices) > 1 else ["threshold"]
         names = [name for name in per_sensor for _ in range(task.sensors)]
@@ -165,11 +178,11 @@ class RuleSearch:
         return tuple(min(trials, key=lambda t: t.cost(price)) for price in self.prices)
 
     def start_costs(self, trials: Sequence[ThresholdTrial]) -> Array:
-        """The costs of the start's trials, each at its price."""
+        """Return the costs of the trials, each at its price."""
         return np.array([t.cost(p) for t, p in zip(trials, self.prices, strict=True)])
 
     def first_point(self) -> Array:
-        """The coordinates at the start: the powers of the price that fit its numbers best."""
+        """Return the start in coordinates: the powers of the price that fit its numbers best."""
         ratio = np.log(np.array(self.prices) / self.reference_price)
         values = dict[str, float]()
         for name, exponent in (("threshold", "price_exponent"), ("margin", "margin_exponent")):
@@ -182,7 +195,7 @@ class RuleSearch:
         return np.array([np.clip(values.get(name, 0.0), *ends) for name, ends in start])
 
     def numbers(self, points: Array) -> ThresholdNumbers:
-        """The numbers (…, K) of K points (K, coordinates)."""
+        """Return the numbers (…, K) of K points (K, coordinates)."""
         names = np.array(self.coordinates)
         none = np.zeros((1, len(points)))
         columns = dict.fromkeys(ThresholdNumbers._fields, none) | {"price_exponent": none + 1.0}
@@ -195,9 +208,13 @@ class RuleSearch:
 def search_of_class(
     name: ClassName, task: Task, prices: Sequence[float], **options: Any
 ) -> RuleSearch:
-    """Return the search of a class, by the score with the cheapest single thresholds.
+    """Return the search of a class of rules, with the score of the cheapest single thresholds.
 
-    ``options`` are other fields of :class:`RuleSearch`.
+    Args:
+        name: the class.
+        task: the task.
+        prices: prices of a token.
+        **options: other fields of :class:`RuleSearch`.
 
     Raises:
         ConfigurationError: a value that is not allowed, or a task without such rules.
@@ -214,11 +231,7 @@ def search_of_class(
 def try_thresholds(
     task: Task, template: str, values: Sequence[float], episodes: int, seed: int
 ) -> list[ThresholdTrial]:
-    """Run a rule with each of its thresholds, ``{value}`` in the template, side by side.
-
-    Raises:
-        ConfigurationError: no ``{value}``, or a policy that there is not.
-    """
+    """Run a rule with each of several thresholds, ``{value}`` in the template, in one batch."""
     if "{value}" not in template:
         raise validation.refusal("template", template, "a policy with {value} for its threshold")
     texts = [template.replace("{value}", f"{value:.5g}") for value in values]
@@ -238,13 +251,16 @@ def search_rule(
     earlier: Sequence[Generation] = (),
     progress: Callable[[Generation], Any] | None = None,
 ) -> SearchResult:
-    """Search, and measure the result on fresh episodes.
+    """Run a search, and measure its result on fresh episodes.
 
-    ``earlier`` are the generations of an interrupted search, which goes on after them as if it had
-    not been interrupted. ``progress`` is called with every new one.
+    Args:
+        search: the search.
+        earlier: generations of an interrupted search, which continues after them with the same
+            result.
+        progress: function that receives every new generation.
 
     Raises:
-        ConfigurationError: the package cmaes is absent, or generations of another search.
+        ConfigurationError: the package cmaes is missing, or ``earlier`` belongs to another search.
     """
     generations = list(earlier)
     for generation in run_generations(search, earlier):
@@ -255,11 +271,7 @@ def search_rule(
 
 
 def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> Iterator[Generation]:
-    """The generations of a search after the ``earlier`` ones, each when it is needed.
-
-    Raises:
-        ConfigurationError: the package cmaes is absent, or generations of another search.
-    """
+    """Yield the generations of a search after the earlier ones."""
     require("a search of a rule", "agents", "cmaes")
     from cmaes import CMA
 
@@ -289,11 +301,7 @@ def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> I
 
 
 def search_result(search: RuleSearch, generations: Sequence[Generation]) -> SearchResult:
-    """The mean of the second half of the generations' means, measured on fresh episodes.
-
-    Raises:
-        ConfigurationError: no generations.
-    """
+    """Measure the mean of the second half of the generations' means on fresh episodes."""
     if not generations:
         raise validation.refusal("generations", generations, "one or more")
     mean = np.mean([item.mean for item in generations[len(generations) // 2 :]], axis=0)
@@ -316,13 +324,13 @@ def search_result(search: RuleSearch, generations: Sequence[Generation]) -> Sear
 
 
 def _objectives(search: RuleSearch, points: Array, episodes: int, seed: int) -> tuple[float, ...]:
-    """Each point's cost over the cost of the best single threshold, averaged over the prices."""
+    """Return each point's cost over the cost of the best single threshold, averaged over prices."""
     costs = _costs(search, search.numbers(points), episodes, seed)
     return tuple((costs / search.start_costs(search.start)).mean(-1).tolist())
 
 
 def _costs(search: RuleSearch, numbers: ThresholdNumbers, episodes: int, seed: int) -> Array:
-    """The costs (K, prices) of the numbers (…, K), on the same episodes."""
+    """Return the costs (K, prices) of the numbers (…, K), on the same episodes."""
     shape = (numbers.margin.shape[-1], len(search.prices), episodes)
     candidate, price, episode = (place.ravel() for place in np.indices(shape))
     policy = PricedThreshold(search.task, own=search.own, score=search.score)

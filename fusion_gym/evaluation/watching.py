@@ -1,4 +1,4 @@
-"""Policies side by side on the same noise, as pictures of one episode."""
+"""Draw one episode of several policies on the same noise."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -36,7 +36,7 @@ class _Watched:
         self.steps += 1
 
     def title(self) -> str:
-        """The policy, and what it has brought so far."""
+        """Return the name of the policy with its mean error and packets."""
         after = max(self.steps, 1)
         name = self.name if len(self.name) <= _LETTERS else f"{self.name[: _LETTERS - 1]}…"
         error, packets = self.error / after, self.packets / after
@@ -46,15 +46,31 @@ class _Watched:
 def watch(
     task: Task, policies: Mapping[str, Policy], seed: int = 0, steps: int | None = None
 ) -> Iterator[Frame]:
-    """Pictures (height, width, 3) of the episode with this seed, before it and after each step.
+    """Return pictures of one episode, before the first step and after each step.
 
-    Every policy, by the name that stands above its picture, meets the same noise; the pictures
-    stand side by side, with the same axes. ``steps`` instead of the whole horizon.
+    All policies run on the same noise. Their pictures stand side by side and share their axes.
+
+    Args:
+        task: the task.
+        policies: policies by the name above their picture.
+        seed: seed of the episode, >= 0.
+        steps: number of steps; the horizon by default.
+
+    Returns:
+        An iterator of pictures (height, width, 3).
 
     Raises:
         ConfigurationError: no policy, a negative seed, more steps than the horizon, or matplotlib
-            is absent; at once, not with the first picture.
-        LookupError: a policy looks at a signal that the task withholds.
+            is missing; before the first picture.
+        LookupError: a policy uses a signal that the task withholds.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import watch
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> frames = watch(task, {"always": make_policy("always", task)}, steps=2)
+        >>> [frame.ndim for frame in frames]
+        [3, 3, 3]
     """
     validation.integer("seed", seed, at_least=0)
     if steps is not None:
@@ -80,7 +96,7 @@ def _frames(watched: list[_Watched], steps: int) -> Iterator[Frame]:
 
 
 def _beside(watched: list[_Watched]) -> Frame:
-    """The pictures of all, with axes that reach as far as any of them needs."""
+    """Return the pictures side by side, with common limits of their axes."""
     needed = zip(*(item.film.limits() for item in watched), strict=True)
     limits = [(min(low for low, _ in ends), max(high for _, high in ends)) for ends in needed]
     return np.hstack([item.film.frame(title=item.title(), limits=limits) for item in watched])

@@ -1,1 +1,1 @@
-"""What commands show and write: tables, figures, progress, files."""
+"""The output of commands: tables, figures, progress and files."""

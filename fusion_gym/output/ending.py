@@ -1,4 +1,4 @@
-"""How every command ends: with one line for what is no bug, and an exit status."""
+"""The end of a command: one line for errors of the user or the machine, and an exit status."""
 
 import contextlib
 import functools
@@ -14,7 +14,7 @@ from typing import Any
 from fusion_gym.core.system import SignalError
 from fusion_gym.validation import ConfigurationError
 
-# Where Python and packages are, whose frames are not a user's.
+# Folders of Python and of packages, whose frames are not a user's.
 _INSTALLED = ("<", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
 
 # Modules that run commands; the others call a user's code.
@@ -23,15 +23,13 @@ _COMMANDS = ("agents.", *(f"fusion_gym.{name}." for name in ("commands", "output
 
 @contextlib.contextmanager
 def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[None]:
-    """Let what a user or the machine did wrong end the program with one line.
+    """End the program with one line after an error of the user or the machine.
 
-    An error in a user's code ends with its file and line. Anything else is an error of the
-    program's own, and keeps its traceback.
+    An error in a user's code ends with its file and line. Any other error keeps its traceback. The
+    exit status is 1, after an interrupt 130, and after a closed output 141.
 
-    Raises:
-        SystemExit: a setting that is not allowed, a file or the memory that the system refuses
-            (status 1, one line says what); an interrupt (130, after the line ``interrupted``
-            returns); nobody reads the output any more (141, and nothing is said).
+    Args:
+        interrupted: function that returns the line after an interrupt.
     """
     try:
         _write_anything()
@@ -56,11 +54,7 @@ def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Ite
 
 @contextlib.contextmanager
 def name_user_code() -> Iterator[None]:
-    """Turn an error in a user's code that the library called into one line with its place.
-
-    Raises:
-        ConfigurationError: names file, line and error. Errors of ours pass.
-    """
+    """Turn an error in a user's code that the library called into one line with its place."""
     try:
         yield
     except (ConfigurationError, BrokenPipeError):
@@ -82,7 +76,7 @@ def name_user_code() -> Iterator[None]:
 
 @contextlib.contextmanager
 def on_signal(number: int, handler: Any) -> Iterator[None]:
-    """Handle a signal this way while the context is entered."""
+    """Handle a signal by this handler inside the context."""
     before = signal.signal(number, handler)
     try:
         yield
@@ -90,18 +84,18 @@ def on_signal(number: int, handler: Any) -> Iterator[None]:
         signal.signal(number, before)
 
 
-# Ended from outside like by Ctrl-C, so that workers stop too.
+# SIGTERM acts like Ctrl-C, so that workers stop too.
 ended_like_by_ctrl_c = functools.partial(on_signal, signal.SIGTERM, signal.default_int_handler)
 
 
 def flush() -> None:
-    """What was printed arrives, or an error says that it did not."""
+    """Flush the output, or raise an error if it cannot be written."""
     if sys.stdout is not None:  # it is None where it was closed
         sys.stdout.flush()
 
 
 def _drop_output() -> None:
-    """What cannot be printed is forgotten; the interpreter would try once more at its end."""
+    """Discard output that cannot be written, which the interpreter would try again at its end."""
     try:
         flush()
     except OSError:
@@ -109,11 +103,11 @@ def _drop_output() -> None:
 
 
 def _write_anything() -> None:
-    """Characters that the terminal does not know are printed as escapes."""
+    """Print characters that the terminal does not support as escapes."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _joined(message: object) -> str:
-    """The message in one line."""
+    """Return the message in one line."""
     return " ".join(line.strip() for line in str(message).splitlines())

@@ -1,4 +1,4 @@
-"""Figures: the Pareto front."""
+"""Figures of results: the Pareto front."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from fusion_gym.output.palette import AGENT, INK
 
 
 class FigureLine(NamedTuple):
-    """One curve of the Pareto figure: its label and its policies' results, in sweep order."""
+    """A curve of the Pareto figure: its label and its policies' results, in sweep order."""
 
     label: str
     results: Sequence[EpisodeResults]
@@ -29,11 +29,7 @@ def pareto(
     agent: FigureLine,
     envelope: Sequence[EnvelopePoint],
 ) -> None:
-    """MSE against transmission rate, with 95 % intervals over episodes.
-
-    ``lines`` are the swept baselines, ``points`` single policies, ``agent`` the learned one at each
-    of its prices, ``envelope`` the lower convex hull of the baselines.
-    """
+    """Draw MSE against transmission rate, with 95 % intervals over episodes."""
     figure, axes = plt.subplots(figsize=(8.6, 5.6))
     colours = plt.get_cmap("tab20")
     for place, line in enumerate(lines):
@@ -44,7 +40,7 @@ def pareto(
     right = axes.get_xlim()[1]
     known = [point.rate for point in hull]
     rates = np.union1d(known, np.linspace(known[0], max(right, known[-1]), 400))
-    errors = np.interp(rates, known, [point.mse for point in hull])  # a mixture's, on any axis
+    errors = np.interp(rates, known, [point.mse for point in hull])  # of mixtures
     axes.plot(rates, errors, "--", color=INK, lw=1, label="lower envelope of the baselines")
     size = 15.0 if len(agent.results) == 1 else 9.0
     _draw(axes, agent.label, agent.results, AGENT, marker="*", size=size)
@@ -63,7 +59,7 @@ def pareto(
 
 
 def _plain_tick(value: float, place: float | None = None) -> str:
-    """The labels of a logarithmic axis: 0.1, 0.2, 0.3, 0.5, 1, …"""
+    """Return the label of a logarithmic axis: 0.1, 0.2, 0.3, 0.5, 1, …"""
     text = f"{value:g}"
     return text if f"{value:.0e}"[0] in "1235" else ""
 
@@ -87,7 +83,7 @@ def _draw(
 
 
 def save_figure(figure: plt.Figure, *paths: Path) -> None:
-    """Write a figure in one move a path, and close it; the same figure gives the same bytes."""
+    """Write a figure to each path atomically, and close it; equal figures give equal bytes."""
     try:
         for path in paths:
             metadata = {"Date": None} if path.suffix == ".svg" else {}

@@ -1,4 +1,4 @@
-"""Files that are whole: each is written under another name and moved to its own at the end."""
+"""Atomic writes: each file is written under another name and then moved to its own."""
 
 import json
 import os
@@ -13,22 +13,25 @@ from typing import Any
 
 from fusion_gym.validation import ConfigurationError, read_text
 
-# What reading a damaged archive raises; RuntimeError where a part says that it is encrypted.
+# Errors from a damaged archive; RuntimeError where a part is encrypted.
 DAMAGED = (
     *(OSError, EOFError, KeyError, TypeError, ValueError, RuntimeError),
     *(struct.error, zipfile.BadZipFile, zlib.error),
 )
-_PARTIAL = re.compile(r"\.\d+\.part(\.\w+)?$")  # with the process that writes it
+_PARTIAL = re.compile(r"\.\d+\.part(\.\w+)?$")  # with the id of the writing process
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file beside ``path`` to be written, which replaces ``path`` at the end of the block.
+    """Yield a partial file, which replaces ``path`` at the end of the block.
 
-    Whoever reads ``path`` finds what was there before or all of what is new, whenever the process
-    is killed; where the block fails, nothing is left of it. Folders are made. The partial file has
-    the suffix of ``path``, and in its name the process, so that two never write the same one. A
-    link's target is replaced, and what is no plain file (``/dev/stdout``) is written to directly.
+    A reader of ``path`` finds the old file or the complete new file, even if the process is killed.
+    If the block fails, the partial file is removed. Missing folders are created. The name of the
+    partial file contains the process id, so two processes never share it. For a link its target is
+    replaced; a path that is no plain file (``/dev/stdout``) is written directly.
+
+    Args:
+        path: the file to replace.
 
     Raises:
         OSError: the folder or the file cannot be written.
@@ -42,7 +45,7 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield partial
         partial.replace(path)
-    except OSError as error:  # that of a full disk names no file
+    except OSError as error:  # the error of a full disk names no file
         error.filename = str(path)
         raise
     finally:
@@ -50,33 +53,26 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove what killed processes left half-written; nobody else may be writing there.
-
-    In the folders within, too, but there only tables, JSON and episodes.
-    """
+    """Remove the partial files of killed processes; no other process may write in the folder."""
     for partial in (*folder.glob("*"), *folder.glob("*/*.part.[cjn]*")):
         if _PARTIAL.search(partial.name):
             partial.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file in one move."""
+    """Replace a text file atomically."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write(path: Path | None, report: Mapping[str, Any]) -> None:
-    """Replace a JSON file, if one is wanted, in one move."""
+    """Replace a JSON file atomically; do nothing without a path."""
     if path is not None:
         write_text(path, json.dumps(report, indent=1) + "\n")
 
 
 def read_json(path: Path, name: str) -> dict[str, Any]:
-    """The object that a JSON file holds; ``name`` is what an error calls it.
-
-    Raises:
-        ConfigurationError: it cannot be read, or holds no JSON object; one line says which.
-    """
+    """Return the object in a JSON file; ``name`` is the file's name in error messages."""
     text = read_text(name, path)
     try:
         content = json.loads(text)

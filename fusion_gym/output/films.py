@@ -1,4 +1,4 @@
-"""Films of frames that come one by one: GIF and MP4, by imageio."""
+"""Write films as GIF or MP4, by imageio."""
 
 import contextlib
 import errno
@@ -14,23 +14,20 @@ ENDINGS = (".gif", ".mp4")
 
 
 def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:
-    """Write the frames as they come; the file is there when the last has come, and whole.
-
-    Heights and widths must be even, as the codec of MP4 wants them.
-    """
+    """Write frames of even height and width as a film; the file appears after the last frame."""
     import imageio.v2 as imageio
 
     writer: Any
     settings: dict[str, Any]
     if path.suffix.lower() == ".gif":
-        # 64 colours are plenty for lines; only what changes is written.
+        # 64 colours suffice for lines; only changed pixels are written.
         settings = {"duration": 1000 / fps, "loop": 0, "palettesize": 64, "subrectangles": True}
     else:
         settings = {"fps": fps, "macro_block_size": 2}
     with replacing(path) as unfinished:
-        # A GIF in memory, for its writer tries once more where the disk is full.
+        # A GIF in memory, because its writer tries again on a full disk.
         goal: Any = io.BytesIO() if path.suffix.lower() == ".gif" else unfinished
-        # Closed after an error too, which the writer's own context leaves to the collector.
+        # Closed after an error too, unlike by the writer's own context.
         with contextlib.closing(
             imageio.get_writer(goal, format=path.suffix[1:].upper(), **settings)
         ) as writer:
@@ -42,7 +39,7 @@ def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:
 
 
 def _complete(film: Path, count: int) -> bool:
-    """Whether a film has so many frames; its codec does not tell of a full disk."""
+    """Return whether a film has so many frames; its codec does not report a full disk."""
     from imageio_ffmpeg import count_frames_and_secs
 
     try:

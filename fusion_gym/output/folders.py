@@ -1,4 +1,4 @@
-"""Folders of results: one process at a time, and the inputs that a result was made from."""
+"""Folders of results: a lock for one process, and a check of the inputs of a result."""
 
 import hashlib
 import json
@@ -15,14 +15,7 @@ from fusion_gym.validation import ConfigurationError
 
 @contextmanager
 def alone_in(folder: Path, name: str) -> Iterator[None]:
-    """The folder, made if it is not there, for this process alone; ``name`` is its option.
-
-    The lock is the operating system's and ends with the process, however that ends. What killed
-    processes left half-written is removed.
-
-    Raises:
-        ConfigurationError: another process works in the folder, or it cannot be written.
-    """
+    """Lock a folder for this process, create it if needed, and remove old partial files."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".lock")
@@ -44,19 +37,13 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
 
 
 def fingerprint(inputs: Mapping[str, Any]) -> str:
-    """A hash of plain inputs, the same in every process."""
+    """Return a hash of plain inputs, the same in every process."""
     plain = json.dumps(inputs, sort_keys=True, default=list)
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
 def check_inputs(arguments: Mapping[str, Any], earlier: Any, label: str) -> None:
-    """Whether what is there was made from the inputs that are given now.
-
-    ``earlier`` are the inputs kept with it, and ``label`` says what it is, for the error.
-
-    Raises:
-        ConfigurationError: it was not; names the first input that differs, with both values.
-    """
+    """Check that an earlier result has the same inputs; an error names the first difference."""
     now = _flat(json.loads(json.dumps(arguments, default=list)))
     then = _flat(earlier) if isinstance(earlier, Mapping) else {}
     if not then:
@@ -78,7 +65,7 @@ _ABSENT = _Absent()
 
 
 def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested values by their dotted names."""
+    """Return nested values by their dotted names."""
     result: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and value:

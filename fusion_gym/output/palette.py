@@ -1,7 +1,7 @@
-"""The colours and marks of all figures of results: one for each kind of policy, everywhere.
+"""The colours and marks of all figures of results.
 
-From the palette of M. Okabe and K. Ito, which people who are colour-blind tell apart. Rules are
-blue, agents orange, lighter without memory; what stands still is grey or black.
+The palette is from M. Okabe and K. Ito, for colour-blind readers. Rules are blue and agents orange,
+lighter without memory; fixed elements are grey or black.
 """
 
 import os
@@ -30,7 +30,7 @@ plt.rcParams.update(
         "grid.alpha": 0.25,
         "legend.frameon": False,
         "svg.hashsalt": "fusion-gym",
-        "text.parse_math": False,  # labels of users are text
+        "text.parse_math": False,  # users' labels are text
     }
 )
 LARGE: Any = {
@@ -38,8 +38,8 @@ LARGE: Any = {
     "axes.titlesize": 15,
     "legend.fontsize": 14,
     "figure.dpi": 100,
-}  # at half width still read
-# Figures of pages: still read at half their width, and their own labels are mathematics.
+}  # readable at half width
+# Figures of pages: readable at half their width, with mathematics in their labels.
 READABLE: Any = {
     "text.parse_math": True,
     "font.size": 11,
@@ -48,6 +48,6 @@ READABLE: Any = {
     "figure.dpi": 130,
     "savefig.dpi": 130,
 }
-# States, sensors and estimates in figures of papers, everywhere the same.
+# States, sensors and estimates in figures of papers.
 TRUTH, MEASURED, FUSED, CENTRAL = BLACK, GREY, VERMILLION, GREEN
 SENSORS = (BLUE, ORANGE, PURPLE, SKY)

@@ -18,7 +18,7 @@ _SUPERSCRIPT = re.compile(r"\^([\dTkmh]|{[\d+\-Tkmh]+})")
 
 
 def plain_text(page: str, terminal: Console) -> str:
-    """Return a page of Markdown as a console shows it: no ticks, no roles, no LaTeX."""
+    """Return a page of Markdown as console text, without ticks, roles and LaTeX."""
     text = re.sub(r"\s*\$\$(.*?)\$\$", lambda formula: _line(formula[1]), page, flags=re.DOTALL)
     text = re.sub(r"(?m)^    .*", lambda line: line[0].replace("`", ""), plain_marks(text))
     text = re.sub(r"(?m)^    (\w+: .* = .*)\n        (.*)", r"- \1\n\n  \2", text)
@@ -44,7 +44,7 @@ class _Page(Markdown):
 
 
 class _Formula(LatexNodes2Text):
-    """A formula as text: a group that is more than a name gets brackets."""
+    """A formula as text, with brackets around a group that is more than a name."""
 
     def group_node_to_text(self, node: Any) -> str:
         text = self.nodelist_to_text(node.nodelist).strip()

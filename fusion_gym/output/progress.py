@@ -1,11 +1,11 @@
-"""Where long work is: one look on a terminal, plain lines elsewhere, nothing where it is quiet.
+"""The progress of long work: bars on a terminal, plain lines elsewhere.
 
     writing(("models and validations", folder))
     with progress_bar(total, "training") as bar:
         bar.update(steps)
 
-All of it goes to stderr. On a terminal every piece of work has a bar; a file or a pipe gets a line
-now and then, without control characters; a closed stderr gets nothing.
+All output goes to stderr. On a terminal every piece of work has a bar. A file or a pipe receives a
+line at intervals, without control characters; a closed stderr receives nothing.
 """
 
 import contextlib
@@ -23,13 +23,18 @@ from rich.table import Column
 from rich.text import Text
 
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
-_EVERY, _SHARE, _MOST = 20.0, 0.1, 600.0  # seconds between two lines; of the time so far; at most
+_EVERY, _SHARE, _MOST = (
+    20.0,
+    0.1,
+    600.0,
+)  # seconds between two lines; share of the elapsed time; most seconds
 
 
 class Bar:
-    """How far a piece of work is: ``done`` of ``total`` in a ``unit``, given in the plural.
+    """The progress of a piece of work: ``done`` of ``total`` in a ``unit``, given in the plural.
 
-    ``share`` of the work, from 0 to 1, tells the remaining time; ``note`` says what is going on.
+    ``share`` of the work, from 0 to 1, gives the remaining time; ``note`` describes the present
+    work.
     """
 
     def __init__(self, description: str, total: float, unit: str, initial: float = 0.0) -> None:
@@ -41,11 +46,11 @@ class Bar:
         self.plain = False  # whether lines are printed instead of a bar
 
     def update(self, amount: float = 1.0) -> None:
-        """So much more is done."""
+        """Add an amount to ``done``."""
         self.reach(self.done + amount)
 
     def reach(self, done: float, share: float | None = None) -> None:
-        """So much is done in all; ``share`` where its parts take times of their own."""
+        """Set ``done``, and ``share`` if parts of the work differ in duration."""
         self.done = min(max(done, self.done), self.total)
         known = self.done / self.total if share is None and self.total else share or 0.0
         if known > self.share:
@@ -56,22 +61,22 @@ class Bar:
             remark(self.line())
 
     def say(self, note: str) -> None:
-        """What is going on."""
+        """Set the note."""
         self.note = note
 
     @property
     def begun(self) -> bool:
-        """Whether anything has been done."""
+        """Whether the work has advanced."""
         return self.share > self._first
 
     @property
     def seconds(self) -> float:
-        """Since the work was begun, or gone on with."""
+        """Seconds since the start or resumption of the work."""
         return (self._ended or time.monotonic()) - self._began
 
     @property
     def left(self) -> float | None:
-        """Seconds that remain at the mean speed so far; unknown before anything is done."""
+        """Seconds that remain at the mean speed so far; None before the work has advanced."""
         if not self.begun:
             return 0.0 if self.share >= 1.0 else None
         needed = (self._reached - self._began) * (1.0 - self.share) / (self.share - self._first)
@@ -79,23 +84,23 @@ class Bar:
 
     @property
     def count(self) -> str:
-        """What is done, of all."""
+        """``done`` and ``total``, as text."""
         return f"{int(self.done):,}/{int(self.total):,} {self.unit}"
 
     @property
     def clock(self) -> str:
-        """The time so far, and the one that remains."""
+        """The elapsed and the remaining time, as text."""
         if self.share >= 1.0:
             return _time(self.seconds)
         left = "?" if self.left is None else _time(self.left)
         return f"{_time(self.seconds)}, {left} left"
 
     def end(self) -> None:
-        """Nothing more will be done."""
+        """Stop the clock."""
         self._ended, self.plain = time.monotonic(), False
 
     def line(self) -> str:
-        """All of it in one line."""
+        """Return the progress in one line."""
         message = [f"{self.description}: {int(100 * self.share)} %", self.count, self.clock]
         return ", ".join([*message, self.note] if self.note else message)
 
@@ -104,7 +109,7 @@ class Bar:
 def progress_bar(
     total: float, description: str, initial: float = 0.0, quiet: bool = False, unit: str = "steps"
 ) -> Iterator[Bar]:
-    """A bar while this is entered, below others that are; ``initial`` was done before."""
+    """Show a bar inside the context, below the bars of outer contexts."""
     bar = Bar(description, total, unit, initial)
     silent = quiet or is_quiet()
     drawn = not silent and (_SCREEN.progress is not None or _watched())
@@ -120,7 +125,7 @@ def progress_bar(
 
 @contextlib.contextmanager
 def quietly(quiet: bool = True) -> Iterator[None]:
-    """Neither bars nor remarks while this is entered."""
+    """Show neither bars nor remarks inside the context."""
     token = _QUIET.set(quiet or _QUIET.get())
     try:
         yield
@@ -129,12 +134,12 @@ def quietly(quiet: bool = True) -> Iterator[None]:
 
 
 def is_quiet() -> bool:
-    """Whether nothing is to be shown beside results and errors."""
-    return _QUIET.get() or sys.stderr is None  # as the shell's 2>&- leaves it
+    """Return whether only results and errors are shown."""
+    return _QUIET.get() or sys.stderr is None  # after the shell's 2>&-
 
 
 def remark(text: str) -> None:
-    """A line to stderr, above the bars."""
+    """Print a line to stderr, above the bars."""
     if is_quiet():
         return
     if _SCREEN.progress is not None:
@@ -144,12 +149,12 @@ def remark(text: str) -> None:
 
 
 def writing(*goods: tuple[str, Path | str]) -> None:
-    """Say at the beginning of long work what is being written into which folder or file."""
+    """Print the kinds of output and their folders or files."""
     remark("writing " + ", ".join(f"{what} into {place}" for what, place in goods))
 
 
 class _Screen:
-    """The bars of a terminal: those that are entered, one below the other."""
+    """The bars of a terminal, one below the other."""
 
     def __init__(self) -> None:
         self.progress: Progress | None = None
@@ -160,7 +165,9 @@ class _Screen:
             self.progress.add_task("", bar=bar)
             yield
             return
-        watched = sys.stdout is not None and sys.stdout.isatty()  # else it goes on as it is
+        watched = (
+            sys.stdout is not None and sys.stdout.isatty()
+        )  # otherwise stdout is left unchanged
         with Progress(*_columns(), console=Console(stderr=True), redirect_stdout=watched) as result:
             self.progress = result
             try:
@@ -174,7 +181,7 @@ _SCREEN = _Screen()
 
 
 class _Part(ProgressColumn):
-    """A column of an attribute of a bar; ``whole`` ones give way last where room is scarce."""
+    """A column with an attribute of a bar; columns that are not ``whole`` are shortened first."""
 
     def __init__(self, name: str, style: str = "", whole: bool = True) -> None:
         super().__init__(Column(no_wrap=whole))
@@ -186,7 +193,7 @@ class _Part(ProgressColumn):
 
 
 class _Drawn(ProgressColumn):
-    """The bar itself."""
+    """The column of the bar."""
 
     def __init__(self) -> None:
         super().__init__(Column(min_width=8, max_width=20))
@@ -212,5 +219,5 @@ def _time(seconds: float) -> str:
 
 
 def _watched() -> bool:
-    """Whether somebody looks at a terminal that can draw."""
+    """Return whether stderr is a terminal that can draw."""
     return sys.stderr.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")

@@ -12,7 +12,7 @@ from fusion_gym.evaluation.metrics import METRICS, Metric
 
 
 def console() -> Console:
-    """Return a console for plain text, wide enough for tables where the output is no terminal."""
+    """Return a console for plain text, 150 columns wide if the output is no terminal."""
     result = Console(markup=False, emoji=False)
     return result if result.is_terminal else Console(markup=False, emoji=False, width=150)
 
@@ -36,13 +36,13 @@ def table_tables(
 
 
 def table_number(interval: Mapping[str, float]) -> str:
-    """Mean with the half width of its interval."""
+    """Return a mean with the half width of its interval, as text."""
     half = (interval["high"] - interval["low"]) / 2
     return f"{interval['mean']:.4g} ± {half:.2g}"
 
 
 def difference(interval: Interval) -> str:
-    """Mean and ends of an interval, with signs."""
+    """Return the mean and the ends of an interval with signs, as text."""
     return f"{interval.mean:+.4f} [{interval.low:+.4f}, {interval.high:+.4f}]"
 
 
@@ -52,7 +52,7 @@ def evaluation_table(
     quantiles: Mapping[str, Mapping[str, float]],
     differences: Mapping[str, Interval],
 ) -> Table:
-    """One row a policy; ``differences`` to a reference may be empty."""
+    """Return the table of an evaluation, with one row per policy."""
     metrics = {name: metric for name, metric in METRICS.items() if metric.column}
     columns = ["policy", *(metric.column for metric in metrics.values()), "median"]
     columns += ["MSE - reference"] if differences else []
@@ -67,14 +67,14 @@ def evaluation_table(
 
 
 def _cell(metric: Metric, value: Any) -> str:
-    """A metric's mean, over sensors where it has one for each, with its half width if shown."""
+    """Return a metric's mean, averaged over its axis, with its half width if shown."""
     if metric.interval:
         return table_number(value)
     return format(sum(value) / len(value) if metric.axis else value["mean"], metric.form)
 
 
 def state_table(states: Sequence[str], policies: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Root mean square error of each state (and input, where there is one), a row a policy."""
+    """Return the table of the root mean squared error of each state or input, a row per policy."""
     title = "root of the mean squared error over episodes, averaged over time"
     rows = ([name, *(f"{e:.4g}" for e in policy["armse"])] for name, policy in policies.items())
     return table_tables(title, ["policy", *states], rows)

@@ -1,11 +1,11 @@
-"""Every policy: rules, references that know the model, saved agents.
+"""Every policy: trigger rules, reference policies and saved agents.
 
-Each declares the least class of :mod:`fusion_gym.core.system` that knows all that it looks at,
-and a test holds it to that: what lies outside is changed, and its requests stay bitwise equal.
+A policy declares the least knowledge class of :mod:`fusion_gym.core.system` that has every signal
+it uses. A test changes all other signals and requires bitwise equal requests.
 
-The classes with memory are about what a sensor measured and did not deliver. Three papers' triggers
-are of that kind although they keep only a number or a measurement for each sensor:
-``dynamic_event`` and ``adaptive_threshold`` move their thresholds with unsent measurements, and
-``dynamic_event`` and ``adaptive_innovation`` remember a request that the network denied. The
-second is memoryless wherever every request is granted.
+The classes with memory use unsent measurements. Three triggers of papers belong to them although
+they store one number or one measurement per sensor: ``dynamic_event`` and ``adaptive_threshold``
+update their thresholds with unsent measurements, and ``dynamic_event`` and ``adaptive_innovation``
+store a request that the network denied. ``adaptive_innovation`` has no memory where every request
+is granted.
 """

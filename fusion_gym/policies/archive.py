@@ -1,8 +1,8 @@
-"""The archive that Stable-Baselines3 writes, read as data: plain JSON and weights, nothing else.
+"""Read the archive of a Stable-Baselines3 model as data: plain JSON and weights.
 
-Its own loader unpickles what stands as ``:serialized:`` in the archive's ``data``, and whoever
-wrote the file decides what that runs. Here such text stays text, and of the ``.pth`` files the
-policy's alone is read, by torch's loader of plain weights.
+The loader of Stable-Baselines3 unpickles the entries ``:serialized:`` of the archive's ``data``,
+which runs code of the file. This module leaves such entries as text. Of the ``.pth`` files it reads
+only the weights of the policy, by torch's loader of plain weights.
 """
 
 import io
@@ -19,7 +19,7 @@ from fusion_gym.validation import ConfigurationError
 
 LARGEST = 256 * 2**20  # bytes of a part, and of all weights
 _MOST = 1_000  # tensors
-# What a damaged archive makes zipfile raise; RuntimeError where a part is encrypted.
+# Errors of zipfile on a damaged archive; RuntimeError where a part is encrypted.
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -32,16 +32,11 @@ _DAMAGE = (
 
 
 class NeedsTrust(ConfigurationError):
-    """A file that plain JSON and weights do not explain: only code of its own could load it."""
+    """A file that plain JSON and weights cannot restore; only its own code could load it."""
 
 
 def read_plain(file: Path) -> dict[str, Any]:
-    """The archive's ``data``, in which everything pickled is text beside readable attributes.
-
-    Raises:
-        ConfigurationError: no archive, or no plain JSON in it.
-        NeedsTrust: larger than any model here.
-    """
+    """Return the archive's ``data``, with pickled entries as text."""
     content = _part(file, "data")
     try:
         data = json.loads(content)
@@ -53,12 +48,7 @@ def read_plain(file: Path) -> dict[str, Any]:
 
 
 def read_weights(file: Path) -> dict[str, torch.Tensor]:
-    """The policy's weights by name: finite float32.
-
-    Raises:
-        ConfigurationError: no archive, or no weights in it.
-        NeedsTrust: anything but plain weights, or larger than any model here.
-    """
+    """Return the policy's weights by name, finite float32."""
     content = io.BytesIO(_part(file, "policy.pth"))
     try:
         with zipfile.ZipFile(content) as parts:
@@ -70,7 +60,7 @@ def read_weights(file: Path) -> dict[str, torch.Tensor]:
     content.seek(0)
     try:
         data = torch.load(content, map_location="cpu", weights_only=True)
-    except Exception:  # a crafted file raises whatever it likes; torch's advice is not ours
+    except Exception:  # a crafted file may raise any error
         raise NeedsTrust("its policy.pth holds more than plain weights") from None
     if not isinstance(data, dict) or len(data) > _MOST or not all(map(_is_plain, data.values())):
         raise NeedsTrust("its policy.pth is no table of float32 weights")
@@ -83,7 +73,7 @@ def read_weights(file: Path) -> dict[str, torch.Tensor]:
 
 
 def _part(file: Path, name: str) -> bytes:
-    """A part of the archive, never more of it than its size says."""
+    """Return a part of the archive, up to its declared size."""
     try:
         with zipfile.ZipFile(file) as archive:
             about = archive.getinfo(name)

@@ -1,4 +1,4 @@
-"""The one interface of every policy, and what the rules share."""
+"""The interface of every policy, and functions that the rules share."""
 
 import dataclasses
 import functools
@@ -20,38 +20,34 @@ PerSensor = float | tuple[float, ...]
 
 
 class Policy(Protocol):
-    """From signals to requests, for N runs at once.
+    """A function from signals to requests, for N runs.
 
-    ``reset(runs, seed)`` comes before the first call; ``seed`` is for policies that draw. A call
-    takes the signals of one step and returns requests (sensors, N) bool. A run begins a new
-    episode wherever ``signals["start"]`` is true.
+    ``reset(runs, seed)`` precedes the first call; a policy that draws uses ``seed``. A call takes
+    the signals of one step and returns requests (sensors, N) bool. A run begins a new episode where
+    ``signals["start"]`` is true.
 
-    A policy that looks at what is believed (:mod:`fusion_gym.core.signals`) has an attribute
-    ``remember`` as well, ``"scheduler"`` or ``"own"``: whose beliefs. One that answers to the
-    signals of the present step alone may say so by an attribute ``stateless``, true: it can then be
-    asked in the middle of a simulated episode.
+    A policy that uses beliefs (:mod:`fusion_gym.core.signals`) has an attribute ``remember``,
+    ``"scheduler"`` or ``"own"``, the owner of the beliefs. A policy that uses only the signals of
+    the present step may have a true attribute ``stateless``; simulations may then call it inside an
+    episode.
     """
 
     @property
     def knowledge(self) -> Knowledge:
-        """The least class of :mod:`fusion_gym.core.system` that knows all that it looks at."""
+        """The least class of :mod:`fusion_gym.core.system` that has every signal of the policy."""
         ...
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget everything."""
+        """Clear the memory before N = ``runs`` new episodes."""
         ...
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N) for these signals."""
+        """Return the requests (sensors, N) for these signals."""
         ...
 
 
 def owner_of(policy: Policy) -> Owner | None:
-    """Whose beliefs a policy looks at; ``None`` for one that looks at none.
-
-    Raises:
-        ConfigurationError: an attribute ``remember`` that is neither.
-    """
+    """Return the owner of the beliefs that a policy uses, or ``None`` if it uses no beliefs."""
     result = getattr(policy, "remember", None)
     if result is None:
         return None
@@ -61,11 +57,11 @@ def owner_of(policy: Policy) -> Owner | None:
 
 
 def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
-    """Return the signals outside a policy's declared knowledge, and why each is refused."""
-    knower = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # without one it reads all
+    """Return the signals outside a policy's declared knowledge, with the reason of each refusal."""
+    knower = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # no declaration: all signals
     least = {signal.name: signal for signal in task.system.signals}
     if not task.memory and covers(knower, "own"):
-        knower = least_covering((knower, "own_memory"))  # beliefs of the new measurements alone
+        knower = least_covering((knower, "own_memory"))  # beliefs use only the new measurements
     least |= {signal.name: signal for signal in (*MEMORY_SIGNALS, *PLANNING_SIGNALS)}
     node: Knowledge = "own" if covers(task.knowledge, "own") else task.knowledge
     least["observation"] = Signal("observation", node, "(N, entries)", "rows of every class")
@@ -79,16 +75,39 @@ def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
 
 
 def is_stateless(policy: Policy) -> bool:
-    """Whether a policy says that it keeps nothing from step to step and draws nothing."""
+    """Return whether a policy declares that it has no memory and draws nothing."""
     return bool(getattr(policy, "stateless", False))
 
 
 class Rule:
-    """Base of the analytic policies: a dataclass of parameters, checked before anything runs."""
+    """Base class of the trigger rules: a dataclass whose fields are the parameters of the rule.
+
+    A subclass declares ``knowledge``, the least knowledge class with all its signals, and returns
+    requests (sensors, N) bool from ``__call__``. Parameters with a check (:func:`parameter`) are
+    checked at construction. A rule with variables overrides ``reset``, which runs at construction
+    and before the first call.
+
+    Raises:
+        ConfigurationError: a parameter that is not allowed.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> from typing import ClassVar
+        >>> import numpy as np
+        >>> from fusion_gym.policies.base import Rule, shape_of
+        >>> @dataclass
+        ... class EveryThird(Rule):
+        ...     knowledge: ClassVar[str] = "clock"
+        ...
+        ...     def __call__(self, signals):
+        ...         return np.broadcast_to(signals["step"] % 3 == 0, shape_of(signals)).copy()
+        >>> EveryThird().stateless
+        True
+    """
 
     @property
     def knowledge(self) -> Knowledge:
-        """The least class that knows all that it looks at; every rule declares its own."""
+        """The least knowledge class with all signals of the rule; each rule declares its own."""
         raise TypeError(f"{type(self).__name__} does not say who knows what it looks at")
 
     def __post_init__(self) -> None:
@@ -99,67 +118,51 @@ class Rule:
 
     @property
     def stateless(self) -> bool:
-        """Whether it has nothing to forget: no :meth:`reset` of its own."""
+        """Whether the rule has no variables, which means no :meth:`reset` of its class."""
         return type(self).reset is Rule.reset
 
     def column(self, name: str, sensors: int) -> Array:
-        """The parameter of this name as (sensors, 1): one number for all sensors, or one for each.
-
-        Raises:
-            ConfigurationError: another number of entries.
-        """
+        """Return a parameter as (sensors, 1), from one number for all sensors or one for each."""
         return validation.spread(name, getattr(self, name), (sensors,))[:, None]
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Nothing to forget, unless a rule with variables of its own says otherwise."""
+        """Clear the variables of the rule; the base class has none."""
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N) for these signals."""
+        """Return the requests (sensors, N) for these signals."""
         raise TypeError(f"{type(self).__name__} does not say what it requests")
 
 
 def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:
-    """A rule's parameter: its default, and ``check(name, value, **limits)`` for every value."""
+    """Return the field of a parameter with its default and ``check(name, value, **limits)``."""
     check = functools.partial(check, **limits)
     return dataclasses.field(default=default, metadata={"check": check})
 
 
 def not_negative_parameter(name: str, value: Any) -> None:
-    """One number >= 0 or a sequence of them.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Check that a parameter is one number >= 0 or a sequence of such numbers."""
     validation.not_negative(name, value, validation.one_or_each(value))
 
 
 def each_number(name: str, value: Any, **limits: float) -> None:
-    """One number within :func:`validation.number`'s limits or a sequence of them.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Check one number or a sequence of numbers by :func:`validation.number`."""
     for entry in np.atleast_1d(np.asarray(value, dtype=object)):
         validation.number(name, entry, **limits)
 
 
 def check_at_most(name: str, value: int | None) -> None:
-    """How many sensors may be requested in a step: a whole number >= 1, or None for all.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
+    """Check the largest number of requests in a step: a whole number >= 1, or None for no limit."""
     if value is not None:
         validation.integer(name, value, at_least=1, at_most=validation.MOST_SENSORS)
 
 
 def shape_of(signals: Signals) -> tuple[int, int]:
-    """Number of sensors and of runs."""
+    """Return the number of sensors and of runs."""
     return len(signals["token_cost"]), len(signals["tokens"])
 
 
 def surprise(signals: Signals, whitened: bool = False) -> Array:
-    """|ε|² (sensors, N) of the innovations ε, ``whitened``: in predicted standard deviations."""
+    """Return |ε|² (sensors, N) of the innovations ε, ``whitened`` by predicted deviations."""
     innovation = signals["innovation"]
     if whitened:
         innovation = innovation / signals["innovation_deviation"]
@@ -167,9 +170,15 @@ def surprise(signals: Signals, whitened: bool = False) -> Array:
 
 
 def strongest(score: Array, requests: Requests, at_most: int | None, age: Array) -> Requests:
-    """Of the ``requests`` (sensors, N) those ``at_most`` with the highest score in each run.
+    """Return the ``at_most`` requests (sensors, N) with the highest scores in each run.
 
-    Equal scores go to the sensor that was silent for longer, then to the first.
+    Equal scores go to the sensor with the longest silence, then to the first sensor.
+
+    Args:
+        score: score of each sensor (sensors, N).
+        requests: requests of each sensor (sensors, N).
+        at_most: largest number of requests in a run; None for no limit.
+        age: steps since the last delivery (sensors, N).
     """
     sensors = len(score)
     if at_most is None or at_most >= sensors:

@@ -1,4 +1,4 @@
-"""What the rules share that look at what is believed."""
+"""Functions that the rules on beliefs share."""
 
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -14,9 +14,9 @@ from fusion_gym.validation import ConfigurationError, boolean, refusal
 
 @dataclass
 class BeliefRule(Rule):
-    """A rule on what is believed: the scheduler's, or with ``own`` every sensor's by itself.
+    """A rule on the beliefs of the scheduler, or with ``own`` on the beliefs of each sensor.
 
-    ``together`` names the parameters that take more than one sensor to decide.
+    ``together`` names the parameters that compare sensors, which ``own`` excludes.
     """
 
     task: Task = field(repr=False)
@@ -31,30 +31,23 @@ class BeliefRule(Rule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """By the task's memory and by who decides."""
+        """The knowledge class, by the task's memory and by ``own``."""
         return knows(self.task, self.own)
 
     def beliefs(self, signals: Signals) -> Beliefs:
-        """The scheduler's beliefs, or every sensor's own."""
+        """Return the beliefs of the scheduler, or of each sensor."""
         return beliefs_of(signals, self.own)
 
 
 def knows(task: Task, own: bool) -> Knowledge:
-    """The class of a rule that looks at all that is believed, in a task with or without memory."""
+    """Return the knowledge class of a rule on beliefs, in a task with or without memory."""
     if task.memory:
         return "own_memory" if own else "scheduler_memory"
     return "own" if own else "scheduler"
 
 
 def check_owner(task: Task, own: bool, **only_together: Any) -> None:
-    """Whether a task lets its policies see the sensors, or every sensor decide by itself.
-
-    ``only_together`` are parameters that take more than one sensor to decide: with ``own`` they
-    must be ``None``, 0 or 1.
-
-    Raises:
-        ConfigurationError: it does not, or such a parameter beside ``own``.
-    """
+    """Check that a task shows the measurements, and with ``own`` allows local decisions."""
     if task.information != "sensors":
         raise ConfigurationError(
             f"information = {task.information!r} is not allowed with this rule: it must be "
@@ -62,14 +55,14 @@ def check_owner(task: Task, own: bool, **only_together: Any) -> None:
         )
     if not own:
         return
-    SensorView(task)  # refuses what a sensor cannot do by itself
+    SensorView(task)  # refuses tasks without local decisions
     for name, value in only_together.items():
         if value not in (None, 0, 1):
             raise refusal(name, value, "left out with own=True, for every sensor decides by itself")
 
 
 def beliefs_of(signals: Signals, own: bool) -> Beliefs:
-    """The scheduler's beliefs, or every sensor's own."""
+    """Return the beliefs of the scheduler, or of each sensor."""
     result: Any = signals["own_beliefs" if own else "beliefs"]
     beliefs: Beliefs = result
     return beliefs

@@ -1,8 +1,8 @@
-"""What a saved agent says of itself, in plain JSON: its card.
+"""The card of a saved agent: its description in plain JSON.
 
-The card is the entry ``fusion_gym_model`` of the archive's ``data``, so it goes through saving and
-loading by Stable-Baselines3. A model without one, or with an earlier one that told less, is
-explained by what Stable-Baselines3 writes in readable form beside all that it pickles.
+The card is the entry ``fusion_gym_model`` of the archive's ``data``, so Stable-Baselines3 saves and
+loads it with the model. For a model without a card, or with an earlier and shorter card, the
+readable entries of Stable-Baselines3 replace it.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "silu": torch.nn.SiLU,
     "tanh": torch.nn.Tanh,
 }
-# What policy_kwargs may hold: an activation, what the weights' shapes tell, and what has no part
-# in a decision. A features_extractor_class, say, is code.
+# The allowed policy_kwargs: an activation, entries that the weights' shapes imply, and entries
+# without influence on a decision. A features_extractor_class, for example, is code.
 _HARMLESS = {
     "activation_fn", "enable_critic_lstm", "log_std_init", "lstm_hidden_size", "n_lstm_layers",
     "net_arch", "normalize_images", "optimizer_class", "optimizer_kwargs", "ortho_init",
@@ -67,9 +67,13 @@ _HARMLESS = {
 
 @dataclass(frozen=True)
 class ModelView:
-    """What a model was trained to see: the entries by name (if the file says), whose, the price.
+    """The observation that a model was trained on.
 
-    ``nominal_error`` (n,) scales the entries of beliefs.
+    Args:
+        observation_names: names of the entries; None if the file has none.
+        local: whether every sensor runs the model on its local view.
+        price_range: range of the price of a token; None for a fixed price.
+        nominal_error: scale of the entries of beliefs (n,); None for none.
     """
 
     observation_names: tuple[str, ...] | None = None
@@ -79,11 +83,7 @@ class ModelView:
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> ModelView:
-        """As the card in an archive's data has it; without a card, a scheduler's whole view.
-
-        Raises:
-            ConfigurationError: an entry that is not allowed.
-        """
+        """Return the view of an archive's card; without a card, the whole view of a scheduler."""
         card_entry = _entry(data)
         names, span = card_entry.get("observation_names"), card_entry.get("price_range")
         error = card_entry.get("nominal_error")
@@ -97,11 +97,7 @@ class ModelView:
         )
 
     def on(self, task: Task) -> Task:
-        """Return the task with the price and the scale that the model was trained with.
-
-        Raises:
-            ConfigurationError: the model has no scale, or one of another number of states.
-        """
+        """Return the task with the price and the scale of the model's training."""
         if self.price_range is not None and task.reward.price.span is None:
             price = Price(None, self.price_range)
             task = replace(task, reward=replace(task.reward, price=price))
@@ -116,21 +112,16 @@ class ModelView:
 
 @dataclass(frozen=True)
 class Blueprint:
-    """What a policy is built from, beside its weights and the task's spaces."""
+    """The description from which a policy is built, with its weights and the task's spaces."""
 
     algorithm: str
     activation: str
     actions: str  # the action space, as Gymnasium writes it
-    network: Mapping[str, Any] | None = None  # as :meth:`NetworkShape.plain` says it
+    network: Mapping[str, Any] | None = None  # as :meth:`NetworkShape.plain` returns it
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> Blueprint:
-        """From the card, or from Stable-Baselines3's own readable entries.
-
-        Raises:
-            ConfigurationError: a card of a later format, or with entries that are not allowed.
-            NeedsTrust: a policy that is none of :data:`POLICIES`, or made with code of its own.
-        """
+        """Return the blueprint of the card, or of the readable entries of Stable-Baselines3."""
         card_entry = _entry(data)
         if "format" not in card_entry:
             return _inferred(data)
@@ -153,7 +144,7 @@ class Blueprint:
 
 
 def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> dict[str, Any]:
-    """A model's card; without a format, and less, if weights alone do not rebuild its policy."""
+    """Return a model's card, shorter and without a format if weights cannot rebuild its policy."""
     view = make_view(task, local)
     entries = {
         "algorithm": algorithm,
@@ -176,16 +167,13 @@ def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) ->
 
 
 def algorithm_name(model: BaseAlgorithm) -> str:
-    """Return the algorithm of a model, one of :data:`ALGORITHMS`, of which its class may be."""
+    """Return the algorithm of a model, one of :data:`ALGORITHMS` or the base of its class."""
     names = {kind: name for name, kind in ALGORITHMS.items()}
     return next(names[kind] for kind in type(model).__mro__ if kind in names)
 
 
 def algorithm_of(data: Mapping[str, Any]) -> str | None:
-    """The algorithm that the card names, or whose policy class the archive's plain entries name.
-
-    A2C and PPO have one policy class; what is neither, but has it too, decides as A2C does.
-    """
+    """Return the algorithm of the card, or of the policy class in the archive's plain entries."""
     card_entry = _entry(data).get("algorithm")
     if isinstance(card_entry, str):
         return card_entry
@@ -195,7 +183,7 @@ def algorithm_of(data: Mapping[str, Any]) -> str | None:
 
 
 def _inferred(data: Mapping[str, Any]) -> Blueprint:
-    """The blueprint of a model without a card, or with an earlier one that tells less."""
+    """Return the blueprint of a model without a card, or with an earlier card."""
     algorithm, settings = algorithm_of(data), _table(data, "policy_kwargs")
     module = _table(data, "policy_class").get("__module__")
     if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
@@ -205,7 +193,7 @@ def _inferred(data: Mapping[str, Any]) -> Blueprint:
     strange = sorted(set(settings) - _HARMLESS - {":type:", ":serialized:"})
     if strange:
         raise NeedsTrust(f"its policy was made with {strange}")
-    usual = ACTIVATIONS["relu" if algorithm == "dqn" else "tanh"]  # what the policies default to
+    usual = ACTIVATIONS["relu" if algorithm == "dqn" else "tanh"]  # the policies' default
     value = settings.get("activation_fn", str(usual))
     names = [n for n, kind in ACTIVATIONS.items() if str(kind) == value]
     if not names:
@@ -217,7 +205,7 @@ def _inferred(data: Mapping[str, Any]) -> Blueprint:
 
 
 def _entry(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The card in an archive's data, empty if there is none."""
+    """Return the card in an archive's data, empty if there is none."""
     return _table(data, ENTRY) if ENTRY in data else {}
 
 

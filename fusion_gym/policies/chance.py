@@ -1,4 +1,4 @@
-"""Uniform numbers for policies that draw: a stream of its own for each run."""
+"""Uniform random numbers for policies that draw, with one stream for each run."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ _BLOCK = 64  # steps drawn at a time
 
 
 class Chance:
-    """Draws uniform numbers in [0, 1), apart from the noise of the same seeds.
+    """A source of uniform numbers in [0, 1), independent of the noise of the same seeds.
 
-    Run i has the stream of ``seed + i`` and the policy's own ``stream`` number, so what a run
-    draws depends neither on what stands beside it nor on any signal.
+    Run i has the stream of ``seed + i`` and the policy's ``stream`` number, so its draws depend
+    neither on the other runs nor on any signal.
     """
 
     def __init__(self, stream: int) -> None:
@@ -19,14 +19,14 @@ class Chance:
         self.reset(0)
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Begin again."""
+        """Restart the streams."""
         seeds = range(seed, seed + runs)
         self._generators = [np.random.default_rng([seed, self._stream]) for seed in seeds]
         self._drawn: Array | None = None
         self._used = 0
 
     def draw(self, sensors: int, runs: int) -> Array:
-        """The numbers (sensors, N) of the next step."""
+        """Return the numbers (sensors, N) of the next step."""
         if len(self._generators) != runs:
             self.reset(runs)
         if self._drawn is None or self._used == _BLOCK:

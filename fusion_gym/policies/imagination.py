@@ -1,4 +1,4 @@
-"""Runs as they could be, from what a scheduler believes: for policies that simulate."""
+"""Simulated runs that start from the beliefs of a scheduler, for policies that simulate."""
 
 from typing import Any
 
@@ -17,10 +17,15 @@ from fusion_gym.validation import ConfigurationError
 
 
 class Imagination:
-    """Makes runs of a task whose hidden parts are drawn anew, to be moved on imagined noise.
+    """A maker of simulated runs, whose hidden parts are drawn from the beliefs.
+
+    Args:
+        task: the task.
+        memory: the scheduler's memory.
+        layout: layout of the observation.
 
     Raises:
-        ConfigurationError: a system that has no way to draw them.
+        ConfigurationError: a system that cannot draw its hidden parts.
     """
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
@@ -35,15 +40,18 @@ class Imagination:
         self._each = task.system.noise_channels + (task.access == "random")
 
     def channels(self, steps: int) -> int:
-        """Standard normals that :meth:`begin` takes for ``steps`` steps."""
+        """Return the number of standard normals that :meth:`begin` takes for ``steps`` steps."""
         return self._first + steps * self._each
 
     def begin(
         self, signals: Signals, runs: NDArray[np.int64], normals: Array
     ) -> tuple[Branch, Array]:
-        """Of the signals' runs those with the numbers ``runs`` (R,), and noise for their steps.
+        """Return simulated runs and the noise of their steps (steps, channels of a step, R).
 
-        From normals (channels, R); the noise is (steps, channels of a step, R).
+        Args:
+            signals: signals of N runs.
+            runs: numbers of R of these runs, with repetitions (R,).
+            normals: standard normals (channels, R).
         """
         task, beliefs = self._task, beliefs_of(signals, own=False)
         first, rest = normals[: self._first], normals[self._first :]

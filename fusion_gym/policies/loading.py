@@ -1,8 +1,8 @@
-"""Loading a saved agent: a model file is data.
+"""Load a saved agent; a model file is data.
 
-The policy is rebuilt from its card, or from the readable part of what Stable-Baselines3 writes, and
-from its weights; nothing in the file is unpickled. ``trust`` loads it with Stable-Baselines3's own
-loader instead, which runs whatever code the file holds.
+The policy is rebuilt from its weights and its card, or from the readable entries of
+Stable-Baselines3 in the place of the card. Nothing in the file is unpickled. With ``trust`` the
+loader of Stable-Baselines3 loads the file and runs code that it contains.
 """
 
 import dataclasses
@@ -38,13 +38,18 @@ def load_model_policy(
     *,
     trust: bool = False,
 ) -> ModelPolicy:
-    """The agent saved at ``path`` (with or without ``.zip``), checked against the task.
+    """Return the agent saved at ``path``, checked against the task.
 
-    With ``trust`` Stable-Baselines3's own loader loads it, which runs code that the file holds.
+    Args:
+        path: the file, with or without ``.zip``.
+        task: the task.
+        deterministic: take the likeliest action instead of a draw.
+        price: price of a token, for an agent that was trained for a range of prices.
+        trust: use the loader of Stable-Baselines3, which runs code of the file.
 
     Raises:
-        ConfigurationError: no such file, no Stable-Baselines3 model, one that its weights alone do
-            not rebuild (without ``trust``), or one of another observation layout or action space.
+        ConfigurationError: no such file, no Stable-Baselines3 model, a model that its weights
+            cannot rebuild (without ``trust``), or another observation layout or action space.
     """
     validation.boolean("deterministic", deterministic)
     file = next((p for p in (Path(path), Path(f"{path}.zip")) if p.is_file()), None)
@@ -69,7 +74,7 @@ def load_model_policy(
 def _rebuilt(
     file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
 ) -> tuple[BaseAlgorithm, str]:
-    """The model from its card and its weights, and its kind of action."""
+    """Return the model from its card and its weights, and its kind of action."""
     blueprint, weights = Blueprint.read(data), read_weights(file)
     network = NetworkShape.of({name: tuple(weight.shape) for name, weight in weights.items()})
     if blueprint.network not in (None, network.plain()):
@@ -85,7 +90,7 @@ def _rebuilt(
         model.policy.load_state_dict(weights, strict=True)
     except RuntimeError:
         raise NeedsTrust(f"its weights are not those of {blueprint.algorithm}") from None
-    if blueprint.algorithm == "dqn":  # which decides by chance with a coin of its own
+    if blueprint.algorithm == "dqn":  # its random decisions need the exploration rate
         rate = data.get("exploration_rate", 0.0)
         model.exploration_rate = validation.number(  # type: ignore[attr-defined]
             "exploration_rate", rate, at_least=0.0, at_most=1.0
@@ -94,7 +99,7 @@ def _rebuilt(
 
 
 def _empty(algorithm: str, view: View) -> BaseAlgorithm:
-    """An algorithm that has neither environment, buffers nor optimiser, and cannot learn."""
+    """Return an algorithm without environment, buffers and optimiser, which cannot learn."""
     kind: Any = ALGORITHMS[algorithm]
     model: BaseAlgorithm = kind(
         POLICIES[algorithm], env=None, device="cpu", _init_setup_model=False
@@ -104,7 +109,7 @@ def _empty(algorithm: str, view: View) -> BaseAlgorithm:
 
 
 def _policy(blueprint: Blueprint, network: NetworkShape, view: View) -> Any:
-    """The policy with weights that do not matter yet; torch's stream of random numbers stays."""
+    """Return the policy with arbitrary weights, without use of torch's global random numbers."""
     kind: Any = POLICIES[blueprint.algorithm]
     with torch.random.fork_rng(devices=[]):
         return kind(
@@ -120,12 +125,12 @@ def _policy(blueprint: Blueprint, network: NetworkShape, view: View) -> Any:
 def _unpickled(
     file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
 ) -> tuple[BaseAlgorithm, str]:
-    """The model as Stable-Baselines3 loads it: this runs code that the file holds."""
+    """Return the model from the loader of Stable-Baselines3, which runs code of the file."""
     problems = []
     for name in _candidates(data):
         try:
             model = ALGORITHMS[name].load(file, device="cpu")
-        except Exception as error:  # whatever the file's own code raises
+        except Exception as error:  # the file's code may raise any error
             problems.append(f"{name}: {error}")
             continue
         shape = model.observation_space.shape or ()
@@ -134,7 +139,7 @@ def _unpickled(
 
 
 def _candidates(data: Mapping[str, Any]) -> list[str]:
-    """The algorithms that may have saved the file, of all that both libraries have."""
+    """Return the algorithms of both libraries that may have saved the file."""
     received, described = algorithm_of(data), data.get("policy_class")
     if received in ALGORITHMS:
         return [received]
@@ -150,11 +155,7 @@ def _candidates(data: Mapping[str, Any]) -> list[str]:
 def _fitted(
     task: Task, observed: ModelView, shape: tuple[int, ...], actions: str
 ) -> tuple[str, View]:
-    """The kind of action that the model has, and the view of the task with it.
-
-    Raises:
-        ConfigurationError: the model sees other entries, or decides on other actions.
-    """
+    """Return the model's kind of action, and the view of the task with it."""
     view, names = make_view(task, observed.local), observed.observation_names
     trained = "it was trained for another observation layout: it expects"
     if names is not None and names != tuple(view.names):

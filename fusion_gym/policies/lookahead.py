@@ -1,4 +1,4 @@
-"""A model-based reference: weigh what every possible transmission would be worth in a few steps."""
+"""A reference policy that compares the effects of all transmissions over the next steps."""
 
 import warnings
 from typing import ClassVar
@@ -15,31 +15,28 @@ from fusion_gym.policies.belief_rule import knows
 from fusion_gym.policies.planning import PlanningModel, transmission_sets
 from fusion_gym.validation import ConfigurationError
 
-_MOST_TOGETHER = 8  # sensors whose sets are all weighed
-_MOST_GREEDY = 40  # of which one after another is added, each time the best of all that are left
+_MOST_TOGETHER = 8  # largest number of sensors for the comparison of all sets
+_MOST_GREEDY = 40  # largest number of sensors for the greedy search
 
 
 class Lookahead:
-    r"""Request the sensors with the least expected error over the next steps and price.
+    r"""Request the set of sensors with the least expected error and price over the next steps.
 
-    A scheduler that knows all new measurements has the best estimate x̂* by delivering them all;
-    with memory, by all that was ever measured. Whatever it lets through, x̂, the fused error's
-    second moment is the unavoidable part plus |x̂* - x̂|², so a set of transmissions is worth what
-    it takes off the sum of that distance, weighted as in the reward, over ``steps`` times, with no
-    noise and no further transmission in between. It asks for the set with the least of that sum
-    plus ``price`` for each token spent. Where packets may be lost it takes the mean over what may
-    arrive of the set: it knows the channel's probabilities and not what the channel is about to
-    do.
+    The best estimate x* uses all new measurements, and with memory all earlier ones. The second
+    moment of the fused error is a part that no decision changes plus ‖x* - x̂‖². The cost of a set
+    is the sum of this distance over ``steps`` steps plus ``price`` for each token. The sum has the
+    weights of the reward and supposes no noise and no further transmission. Where packets may be
+    lost it is the mean over the possible deliveries of the set.
 
-    Of up to 8 sensors every set is weighed. Above that, up to 40, it is ``greedy``, and warns of
-    it: it adds the transmission that lowers the cost most until none does, each by its own
-    probability of arrival as if those before it had arrived.
+    Up to 8 sensors, every set is compared. From 9 to 40 sensors the search is ``greedy``, with a
+    warning: it adds the transmission that lowers the cost most until none lowers it. It weighs
+    each transmission by its probability of arrival as if the earlier ones had arrived.
 
-    It uses the task's model through the system itself (:class:`PlanningModel`), so it works for
-    every system; exact for linear systems, plausible for others. This is neither an optimum nor
-    a bound, but a policy that knows the model.
+    The policy predicts with the task's own system (:class:`PlanningModel`): exactly for linear
+    systems, approximately for others. It is neither an optimum nor a bound.
 
     Args:
+        task: the task, whose model it uses; a text cannot set it.
         price: p >= 0 of a token, in the reward's units.
         steps: h >= 1, steps over which the distance is summed.
 
@@ -53,15 +50,15 @@ class Lookahead:
         x_S(t+k)\rVert_W^2+p\sum_{s\in S}c_s
         $$
 
-        x* and x̂_S are the best estimate and the centre's after the packets of S, both going on
-        without noise and transmissions for h (``steps``) steps; the expectation is over what
-        arrives. W are the weights of the reward's error term, p is ``price``, c the tokens that a
-        transmission costs. S runs over all sets that the network would grant.
+        x* and x̂_S are the best estimate and the centre's estimate after the packets of S, both
+        predicted without noise and transmissions for h (``steps``) steps. The expectation is over
+        the deliveries. W are the weights of the reward's error term, p is ``price``, c the tokens
+        of a transmission. S runs over all sets that the network would grant.
 
     Assumes: x* is the conditional mean given all measurements, a model that is true, and no
     further transmission within the steps.
 
-    Source: none of one paper; receding-horizon control of the decisions, with the value of
+    Source: no single paper; receding-horizon control of the decisions, with the value of
     :mod:`fusion_gym.core.beliefs`.
 
     Example: ``lookahead:price=0.03`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
@@ -106,14 +103,14 @@ class Lookahead:
 
     @property
     def knowledge(self) -> Knowledge:
-        """A scheduler, with what was never sent if the task has memory."""
+        """The class of a scheduler, with memory if the task has memory."""
         return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Nothing to forget."""
+        """Do nothing; the policy has no memory."""
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         model = PlanningModel(self._task, signals)
         best = model.best_means(self.steps)
         return self._one_by_one(model, best) if self.greedy else self._of_all_sets(model, best)
@@ -124,7 +121,7 @@ class Lookahead:
         cost = self._expected_error(model, best)
         cost = cost + self.price * np.stack([g.spent for g in grants])
         for place, selected in enumerate(self._sets[:, :, None]):
-            # What the network would deny is no choice of its own.
+            # A set that the network would deny is no choice.
             cost[place, (grants[place].granted != selected).any(0)] = np.inf
         return np.ascontiguousarray(self._sets[cost.argmin(0)].T)
 
@@ -155,9 +152,13 @@ class Lookahead:
         return selected
 
     def _expected_error(self, model: PlanningModel, best: Array) -> Array:
-        """Weighted squared distance (sets, N) to the best estimate, summed over the steps.
+        """Return the weighted squared distance (sets, N) to the best estimate over the steps.
 
-        The mean over what the channel lets arrive of each set: packets are lost independently.
+        It is the mean over the deliveries of each set; packets are lost independently.
+
+        Args:
+            model: the model of this step.
+            best: best estimates (steps, n, N).
         """
         everyone = np.ones((self._task.sensors, model.runs), np.bool_)
         error = np.empty((len(self._sets), model.runs))
@@ -170,7 +171,7 @@ class Lookahead:
         return error
 
     def _error(self, model: PlanningModel, arriving: Requests, best: Array) -> Array:
-        """The same (N,) if these packets (sensors, N) arrive."""
+        """Return the distance (N,) if these packets (sensors, N) arrive."""
         reward = self._task.reward
         distance = model.fused_means(arriving, self.steps) - best
         weights = reward.error_weight * reward.state_weights

@@ -18,24 +18,26 @@ from fusion_gym.validation import ConfigurationError
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
-    """Write the model's card into it (:mod:`fusion_gym.policies.card`), to be saved with it.
-
-    ``local`` marks a policy that every sensor runs on its own view. A subclass of one of the
-    ``ALGORITHMS`` saves models of that algorithm.
-    """
+    """Write the model's card (:mod:`fusion_gym.policies.card`) into it before it is saved."""
     setattr(model, ENTRY, model_card(algorithm_name(model), model, task, local))
 
 
 class ModelPolicy:
-    """Asks a Stable-Baselines3 model, which sees the task's observation and nothing else.
+    """A Stable-Baselines3 model as a policy, which uses only the task's observation.
 
-    ``trained`` is what the model was trained to see. If it saw the price of a token, it can be
-    asked for any point of its trade-off: ``price`` stands for the task's own price, whether or not
-    the task shows it. Entries of beliefs scale as in its training. A local model is asked by every
-    sensor, about its own view.
+    A local model decides for every sensor on the view of that sensor. The entries of beliefs have
+    the scale of the training.
+
+    Args:
+        model: the model.
+        task: the task.
+        deterministic: take the likeliest action instead of a draw.
+        price: price of a token, for a model that was trained for a range of prices; it replaces the
+            task's own price.
+        trained: the view of the training; the whole view of a scheduler by default.
 
     Raises:
-        ConfigurationError: a price for a model that knows none, or outside its range.
+        ConfigurationError: a price for a model without a range, or a price outside its range.
     """
 
     def __init__(
@@ -77,13 +79,13 @@ class ModelPolicy:
             self.price = float(price_setting.encode(price_setting.draw(np.zeros(1)))[0])
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget the memory of a recurrent policy; draw from the stream of ``seed``."""
+        """Clear the memory of a recurrent policy, and draw from the stream of ``seed``."""
         self._memory = None
         if not self.deterministic:
             self.model.set_random_seed(seed)
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         masks = {}
         if isinstance(self.model, MaskablePPO):
             masks["action_masks"] = self.view.masks(signals["grantable"])
@@ -97,7 +99,7 @@ class ModelPolicy:
         return self.view.requests(action, len(signals["start"]))
 
     def rows(self, signals: Signals) -> Rows:
-        """What the model is shown, (N·rows_per_run, entries) float32."""
+        """Return the observation of the model (N·rows_per_run, entries), float32."""
         observation = signals["observation"]
         if self._layout is not None:
             beliefs = beliefs_of(signals, own=self.view.owner == "own")

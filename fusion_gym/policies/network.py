@@ -1,4 +1,4 @@
-"""The networks of a policy, as the shapes of its weights tell them."""
+"""The networks of a policy, inferred from the shapes of its weights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _VALUES = "q_net.q_net"
 
 @dataclass(frozen=True)
 class _Memory:
-    """The LSTM of a recurrent policy; its critic has one of its own, the actor's, or none."""
+    """The LSTM of a recurrent policy; its critic has its own LSTM, the actor's, or none."""
 
     size: int
     layers: int
@@ -32,14 +32,7 @@ class NetworkShape:
 
     @classmethod
     def of(cls, shapes: Shapes) -> NetworkShape:
-        """The networks that have weights of these shapes.
-
-        Every size is checked against its neighbours, so that what is built of them is about as
-        large as the weights are.
-
-        Raises:
-            NeedsTrust: weights of other networks.
-        """
+        """Return the networks that have weights of these shapes, after a check of all sizes."""
         if f"{_VALUES}.0.weight" in shapes:
             *hidden, last = _chain(shapes, _VALUES)
             entries = (hidden or [last])[0][1]
@@ -57,17 +50,17 @@ class NetworkShape:
         return cls(hidden_sizes, entries, memory)
 
     def fits(self, algorithm: str) -> bool:
-        """Whether policies of this algorithm have such networks."""
+        """Return whether policies of this algorithm have such networks."""
         values, remembers = "q" in self.hidden, self.memory is not None
         return (values, remembers) == (algorithm == "dqn", algorithm == "recurrent_ppo")
 
     def plain(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the sizes as JSON."""
         entries: dict[str, Any] = {head: list(sizes) for head, sizes in self.hidden.items()}
         return entries | ({"memory": vars(self.memory).copy()} if self.memory else {})
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of Stable-Baselines3's policy class."""
+        """Return the arguments of Stable-Baselines3's policy class."""
         if "q" in self.hidden:
             return {"net_arch": list(self.hidden["q"])}
         sizes = {head: list(sizes) for head, sizes in self.hidden.items()}
@@ -83,7 +76,7 @@ class NetworkShape:
 
 
 def _memory(shapes: Shapes) -> tuple[_Memory, int]:
-    """The LSTM, and how many entries it is given."""
+    """Return the LSTM and the number of its inputs."""
     size = _pair(shapes, "lstm_actor.weight_hh_l0")[1]
     layers = 0
     while f"lstm_actor.weight_ih_l{layers}" in shapes:
@@ -102,7 +95,7 @@ def _memory(shapes: Shapes) -> tuple[_Memory, int]:
 
 
 def _chain(shapes: Shapes, prefix: str) -> list[tuple[int, int]]:
-    """(outputs, inputs) of the linear layers, between which the activations stand."""
+    """Return (outputs, inputs) of the linear layers, which activations separate."""
     result: list[tuple[int, int]] = []
     while f"{prefix}.{2 * len(result)}.weight" in shapes:
         result.append(_pair(shapes, f"{prefix}.{2 * len(result)}.weight"))

@@ -1,4 +1,4 @@
-"""What an ONNX file says of itself: its observation with names, scaling and version, its actions.
+"""The metadata of an ONNX file: its observation with names, scale and version, and its actions.
 
 Every value is text; lists and tables are JSON, in which "inf" and "-inf" are infinite numbers.
 """
@@ -38,7 +38,7 @@ _TYPES = {"grantable": "bool", "request": "int8"}
 def onnx_card(
     agent: ModelPolicy, graph: DecisionGraph, environment: str, model: str
 ) -> dict[str, str]:
-    """The metadata of the graph of an agent: ``model`` is how its user calls it."""
+    """Return the metadata of an agent's graph; ``model`` is the user's name of the agent."""
     task, local = agent.task, isinstance(agent.view, SensorView)
     layout = ObservationLayout(task, "own" if local else "scheduler")
     names = list(graph.entries)
@@ -74,7 +74,7 @@ def onnx_card(
 
 
 def layout_version(environment: str, names: list[str]) -> str:
-    """The id of the environment, whose number is its scaling's, and a hash of names and order."""
+    """Return the id of the environment and a hash of the entries' names and order."""
     digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     return f"{environment}:{digest[:16]}"
 
@@ -88,7 +88,7 @@ def _ports(shapes: Shapes) -> dict[str, Any]:
 
 
 def _block(block: Block, local: bool) -> dict[str, Any]:
-    """A kind of entries: ``labels`` of its axes, of which a sensor by itself sees its own row."""
+    """Return a block of entries with the ``labels`` of its axes and its bounds."""
     own = local and block.node == "own"
     return {
         "name": block.name,
@@ -101,14 +101,14 @@ def _block(block: Block, local: bool) -> dict[str, Any]:
 
 
 def _action(agent: ModelPolicy, graph: DecisionGraph) -> dict[str, Any]:
-    """The action space, and which requests each of its numbers stands for."""
+    """Return the action space and the requests of each of its numbers."""
     choices = None if graph.choices is None else graph.choices.tolist()
     space = {"space": str(agent.view.actions), "sensors": agent.task.sensors}
     return space | {"access": agent.task.access, "choices": choices}
 
 
 def _fixed_price(agent: ModelPolicy) -> float | None:
-    """The price of a token at which the agent is always asked."""
+    """Return the fixed price of a token of the agent, if it has one."""
     span = agent.task.reward.price.span
     if agent.price is None or span is None:
         return None
@@ -117,7 +117,7 @@ def _fixed_price(agent: ModelPolicy) -> float | None:
 
 
 def _finite(value: Any) -> Any:
-    """What JSON has no numbers for, as words."""
+    """Return the value with infinite numbers and nan as words."""
     if isinstance(value, dict):
         return {key: _finite(entry) for key, entry in value.items()}
     if isinstance(value, list):

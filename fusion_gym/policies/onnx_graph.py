@@ -1,4 +1,4 @@
-"""A saved agent as an ONNX graph: what a sensor or a scheduler runs without this library."""
+"""A saved agent as an ONNX graph, for sensors and schedulers without this library."""
 
 import importlib
 import warnings
@@ -16,28 +16,32 @@ from fusion_gym.policies.card import POLICIES
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.validation import ConfigurationError
 
-OPSET = 17  # of ONNX 1.12, 2022: all that these networks need, and what older runtimes know
+OPSET = 17  # of ONNX 1.12, 2022: sufficient for these networks, and known to older runtimes
 Shapes = dict[str, tuple[str | int, ...]]  # by name; "batch" is the number of rows
-_CLOSED = -1e8  # the logit that MaskablePPO gives to what is not open
+_CLOSED = -1e8  # MaskablePPO's logit of a masked choice
 
 
 class DecisionGraph(torch.nn.Module):
-    """From rows of an observation to requests, with everything in between.
+    """The graph from rows of an observation to requests.
 
-    ``inputs`` and ``outputs`` are the names in their order, each with its shape; B rows are a run
-    each, or with a local view a sensor of a run each, k sensors decide in a row:
+    ``inputs`` and ``outputs`` are the names in their order, each with its shape. B is the number of
+    rows: one per run, or with a local view one per sensor and run. k sensors decide in a row:
 
-    - ``observation`` (B, entries) float32, clipped here to the layout's bounds; ``entries`` are the
-      names, without the price if the agent is asked at one price: that is then inside.
-    - ``grantable`` (B, k) bool, whom the network would serve: of MaskablePPO alone.
-    - ``hidden`` and ``cell`` (layers, B, size) float32, zero at the start of an episode: of
-      RecurrentPPO alone, whose next ones are the outputs ``hidden_next`` and ``cell_next``.
+    - ``observation`` (B, entries) float32, clipped by the graph to the bounds of the layout;
+      ``entries`` are the names, without the price if the agent has a fixed price, which is a
+      constant of the graph.
+    - ``grantable`` (B, k) bool, the sensors that the network would grant; only for MaskablePPO.
+    - ``hidden`` and ``cell`` (layers, B, size) float32, zero at the start of an episode; only for
+      RecurrentPPO. Their next values are the outputs ``hidden_next`` and ``cell_next``.
     - ``request`` (B, k) int8, the decision: 1 requests to transmit.
-    - ``probability`` (B, k) float32 of a request, as the agent decides while it learns; and the
-      ``logits`` of its distribution. DQN has its ``values`` of the choices instead.
+    - ``probability`` (B, k) float32 of a request during learning, and the ``logits`` of the
+      distribution. DQN has the ``values`` of the choices instead.
+
+    Args:
+        agent: the agent.
 
     Raises:
-        ConfigurationError: an agent that decides by chance, or whose policy is none of these.
+        ConfigurationError: an agent that draws its actions, or whose policy is not supported.
     """
 
     def __init__(self, agent: ModelPolicy) -> None:
@@ -74,7 +78,7 @@ class DecisionGraph(torch.nn.Module):
         self.inputs, self.outputs = self._named(sensors, policy)
 
     def _named(self, sensors: int, policy: Any) -> tuple[Shapes, Shapes]:
-        """Names and shapes of what goes in and comes out."""
+        """Return names and shapes of the inputs and outputs."""
         inputs: Shapes = {"observation": ("batch", len(self.entries))}
         outputs: Shapes = {"request": ("batch", sensors)}
         if self._masked:
@@ -91,7 +95,7 @@ class DecisionGraph(torch.nn.Module):
         return inputs, outputs
 
     def forward(self, observation: torch.Tensor, *more: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The outputs in their order, from the inputs in theirs."""
+        """Return the outputs in their order, from the inputs in their order."""
         rows = torch.minimum(torch.maximum(observation, self.low), self.high)
         if self._price is not None:
             price = torch.full_like(rows[:, :1], self._price)
@@ -122,7 +126,7 @@ class DecisionGraph(torch.nn.Module):
         return policy.action_net(policy.mlp_extractor.forward_actor(features)), memory
 
     def _probability(self, logits: torch.Tensor, open_: torch.Tensor | None) -> torch.Tensor:
-        """Of a request (B, k) where sensors are drawn apart, else of each choice (B, choices)."""
+        """Return the probability of each request (B, k), or with a table of each choice."""
         if self._table is not None:
             if open_ is not None:
                 closed = (1.0 - open_.to(logits.dtype)) @ self._table.T > 0.0
@@ -136,12 +140,12 @@ class DecisionGraph(torch.nn.Module):
         return torch.softmax(pairs, dim=2)[..., 1]
 
     def _taken(self, worth: torch.Tensor) -> torch.Tensor:
-        """The requests (B, k) of the best choice, the first of those alike."""
+        """Return the requests (B, k) of the best choice, the first among equals."""
         assert self._table is not None
         return self._table[worth.argmax(dim=1)].to(torch.int8)
 
     def example(self, rows: int) -> tuple[torch.Tensor, ...]:
-        """Inputs of so many rows, at the start of an episode."""
+        """Return inputs of so many rows, at the start of an episode."""
         result = []
         for name, shape in self.inputs.items():
             sizes = [rows if size == "batch" else int(size) for size in shape]
@@ -151,7 +155,7 @@ class DecisionGraph(torch.nn.Module):
 
 
 def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
-    """Who requests by each number of a discrete action, (choices, k) int8; None of binary ones."""
+    """Return the requests (choices, k) int8 of each discrete action; None for binary actions."""
     view = agent.view
     number = getattr(view.actions, "n", None)
     if len(view.actions.shape or ()) or number is None:
@@ -162,11 +166,7 @@ def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
 
 
 def save_graph(graph: DecisionGraph, path: Path, received: Mapping[str, str]) -> None:
-    """Write the graph as an ONNX file, with ``received`` as its metadata.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the graph as an ONNX file, with ``received`` as its metadata."""
     onnx: Any = importlib.import_module("onnx")
     shapes = {**graph.inputs, **graph.outputs}
     with torch.no_grad(), warnings.catch_warnings():

@@ -15,10 +15,11 @@ from fusion_gym.solvers.task import solve_task
 class OptimalPolicy:
     r"""Request as the solved optimum of a task does, by errors, channels and tokens.
 
-    The exact optimum of an episode knows the steps that are left, the stationary one does not
-    (:func:`solve_task`). ``optimum`` holds the cost that it attains.
+    The exact optimum of an episode depends on the remaining steps, the stationary optimum does not
+    (:func:`solve_task`). ``optimum`` is the solution with its cost.
 
     Args:
+        task: the task; a text cannot set it.
         criterion: ``finite``, the optimum of an episode, or ``average``, the stationary one.
         price: p >= 0 of a token; None for the task's own.
 
@@ -31,13 +32,13 @@ class OptimalPolicy:
         e+\nu),\ \ p+\mathrm{E}\,V_{t+1}(\nu)\right\}
         $$
 
-        One source with a perfect channel, in the literature's order of events: e is the error if
-        nothing is sent, a the source's coefficient, ν its noise, w the weight of the error, p the
-        price of a transmission. The solver has the channel's state, its losses, the tokens and a
-        second source as well; the request is the second choice, best exactly where |e| is at least
-        a threshold.
+        This is one source with a perfect channel, in the literature's order of events: e is the
+        error without a transmission, a the source's coefficient, ν its noise, w the weight of the
+        error, p the price of a transmission. The second choice is the request; it is best exactly
+        where |e| is at least a threshold. The solver also has the channel's state, its losses, the
+        tokens and a second source.
 
-    Assumes: remote estimation of one source or two, whose model is true.
+    Assumes: remote estimation of one or two sources, whose model is true.
 
     Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
     Markovian state", IEEE Trans. Automatic Control 65, 2020, for one source
@@ -56,14 +57,14 @@ class OptimalPolicy:
 
     @property
     def knowledge(self) -> Knowledge:
-        """A sensor's own error, by its thresholds; with a table of two sources both errors."""
+        """The class of a sensor with thresholds, and of a scheduler with a table of two sources."""
         return "own" if self.optimum.threshold is not None else "scheduler"
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Nothing to forget."""
+        """Do nothing; the policy has no memory."""
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         optimum = self.optimum
         error = np.abs(signals["innovation"][:, 0])
         level = optimum.tokens.index(signals["tokens"])

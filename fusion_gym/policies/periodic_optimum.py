@@ -1,4 +1,4 @@
-"""The best periodic schedule of all: a reference for systems whose covariances need no data."""
+"""The best periodic schedule, a reference for covariances that do not depend on the data."""
 
 import itertools
 import math
@@ -21,10 +21,10 @@ from fusion_gym.policies.schedule_file import (
 )
 from fusion_gym.validation import ConfigurationError
 
-_MOST = 200_000  # schedules that one search may compare
-_TOGETHER = 4096  # schedules side by side
-_LONGEST = 1000  # steps after which traces that have not settled are taken as they are
-_SETTLED = 1e-9  # relative change from one cycle to the next below which they have
+_MOST = 200_000  # schedules of one search
+_TOGETHER = 4096  # schedules in one batch
+_LONGEST = 1000  # steps until traces settle, at most
+_SETTLED = 1e-9  # relative change of a settled trace from one cycle to the next
 AVERAGES = ("steady", "episode")
 
 _found: dict[str, Schedule] = {}
@@ -33,37 +33,36 @@ _found: dict[str, Schedule] = {}
 class PeriodicOptimum:
     r"""Repeat the schedule of ``packets`` requests in ``period`` steps with the smallest trace.
 
-    All schedules are compared by the system's own recursion, whatever it costs: the phase against
-    the sensors' sampling and the start matters, so none is left out. It looks at no signal but the
-    clock, and supposes that every request is granted; under a token limit the network may deny
-    some.
+    The search compares all schedules by the system's own recursion, since their phase against the
+    sensors' sampling and the start matters. The policy uses only the clock. It supposes that every
+    request is granted; under a token limit the network may deny some requests.
 
-    The trace is the plain one of the fused error's covariance:
+    The trace is the unweighted trace of the covariance of the fused error:
 
-    - the actual covariance, thus the mean squared error, if the system claims only a bound but
-      can tell (CorrelatedTracking-v1; where the noise scale is drawn, the mean over scales);
-    - else the claimed one. It is the mean squared error in MarkovJumpTracking-v1 with matrix
-      weights or at a centre, and of uncensored Kalman filters with federated fusion. Under
-      covariance intersection it is a bound, and in UnknownInput-v1 a claim under the filter's
-      model of the input, so the best schedule by the claim need not have the smallest error.
+    - the actual covariance, so the trace is the mean squared error, if the system can compute it
+      (CorrelatedTracking-v1; the mean over scales where the noise scale is drawn);
+    - else the claimed covariance. Its trace is the mean squared error in MarkovJumpTracking-v1 with
+      matrix weights or at a centre, and for uncensored Kalman filters with federated fusion. Under
+      covariance intersection it is a bound, and in UnknownInput-v1 it relies on the filter's model
+      of the input. There the best schedule need not have the smallest error.
 
-    ``average="steady"`` takes its mean over the steady state and supposes that an episode is long
-    against the transient from the start. ``"episode"`` takes the mean over the task's horizon from
-    the start, transient included: what an evaluation measures, and the right choice where the
-    plant or a node never settles.
+    ``average="steady"`` takes the mean over the steady state, for episodes that are long against
+    the transient. ``"episode"`` takes the mean over the task's horizon from the start, as an
+    evaluation does; it is the right choice where the plant or a node never settles.
 
-    The result of a search is kept while the process lives, and with ``cache``, a path, in a file.
+    The process caches the result of a search, and with ``cache`` a file does.
 
     Args:
+        task: the task; a text cannot set it.
         packets: q, the requests of all sensors in a period.
         period: p, in steps.
-        cache: path of a file that keeps the schedule; None for none.
+        cache: path of a file that stores the schedule; None for none.
         average: ``steady`` for the steady state, or ``episode`` for an episode from its start.
 
     Raises:
         ConfigurationError: a number that is not allowed, more schedules than can be compared, a
-            task whose access is not "any", or a system whose covariances depend on the data (it
-            declares the contrary by a ``covariance_cycle`` that is not None).
+            task whose access is not "any", or a system whose covariances depend on the data
+            (without a ``covariance_cycle``).
 
     Equation:
         $$
@@ -76,10 +75,10 @@ class PeriodicOptimum:
 
     Assumes: covariances that depend on no data, and that every request is granted.
 
-    Source: none of one paper; exhaustive search. That a periodic schedule comes arbitrarily
-    near the best of all: L. Zhao, W. Zhang, J. Hu, A. Abate and C. J. Tomlin, "On the optimal
-    solutions of the infinite-horizon linear sensor scheduling problem", IEEE Trans. Automatic
-    Control 59, 2014.
+    Source: exhaustive search, no single paper. L. Zhao, W. Zhang, J. Hu, A. Abate and
+    C. J. Tomlin, "On the optimal solutions of the infinite-horizon linear sensor scheduling
+    problem", IEEE Trans. Automatic Control 59, 2014, show that periodic schedules come arbitrarily
+    near the optimum.
 
     Example: ``periodic_optimum:packets=2,period=6`` in ``fusion_gym/MarkovJumpTracking-v1``.
     """
@@ -117,10 +116,10 @@ class PeriodicOptimum:
         self.schedule, self.trace = optimum(task.system, packets, period, cache, steps)
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Nothing to forget."""
+        """Do nothing; the policy has no memory."""
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         place = np.asarray(signals["step"]) % len(self.schedule)
         return np.ascontiguousarray(self.schedule[place].T)
 
@@ -132,11 +131,16 @@ def optimum(
     cache: str | None = None,
     steps: int | None = None,
 ) -> Schedule:
-    """The schedule with the smallest trace, from memory or ``cache`` if it is known.
+    """Return the schedule with the smallest trace, from the cache if it is known.
 
-    The trace is averaged over the first ``steps`` steps from the start; ``None`` stands for the
-    steady state. Of equal traces (to a relative 1e-9) the first in the order of its steps and
-    sensors wins.
+    Of equal traces (to a relative 1e-9) the first schedule in the order of steps and sensors wins.
+
+    Args:
+        system: declares a ``covariance_cycle``.
+        packets: requests of all sensors in a period.
+        period: number of steps of the schedule.
+        cache: path of a file of schedules; None for none.
+        steps: number of steps of the mean from the start; None for the steady state.
 
     Raises:
         ConfigurationError: the system's covariances depend on the data.
@@ -151,12 +155,12 @@ def optimum(
 
 
 def steady_traces(system: System[Any], schedules: Patterns) -> Array:
-    """Plain traces (N,) of the fused error's covariance, settled, of periodic schedules.
+    """Return the steady-state traces (N,) of the fused error's covariance under periodic schedules.
 
-    The system runs without noise, one run a schedule: its covariances do not depend on the data.
-    The average is over the common period of schedules and sampling, the first one that differs
-    by less than 1e-9 from the one before in all runs, or the one in which step 1,000 lies. That
-    is no steady state where the plant or a node never settles.
+    The system runs without noise, one run per schedule, since its covariances do not depend on the
+    data. A cycle is the common period of schedules and sampling. The mean is over the first cycle
+    that differs in all runs by less than a relative 1e-9 from the cycle before. After 1,000 steps
+    it is over the last cycle, which is no steady state where the plant or a node never settles.
 
     Args:
         system: declares a ``covariance_cycle``.
@@ -178,17 +182,13 @@ def steady_traces(system: System[Any], schedules: Patterns) -> Array:
 
 
 def episode_traces(system: System[Any], schedules: Patterns, steps: int) -> Array:
-    """Plain traces (N,) as in :func:`steady_traces`, averaged over ``steps`` steps from the start.
-
-    Raises:
-        ConfigurationError: the system's covariances depend on the data.
-    """
+    """Return traces (N,) as in :func:`steady_traces`, averaged over the first ``steps`` steps."""
     _cycle(system)
     return _Still(system, schedules).total(steps) / steps
 
 
 class _Still:
-    """Runs without noise from the start, one a schedule (period, sensors, N)."""
+    """Runs without noise from the start, one per schedule (period, sensors, N)."""
 
     def __init__(self, system: System[Any], schedules: Patterns) -> None:
         self._covariance: Callable[[Any], Array] = lambda state: system.fused(state)[1]
@@ -201,7 +201,7 @@ class _Still:
         self._state = self._system.start(np.zeros((system.start_channels, runs)))
 
     def total(self, steps: int) -> Array:
-        """Sum (N,) of the traces over the next ``steps`` steps."""
+        """Return the sum (N,) of the traces over the next ``steps`` steps."""
         total = np.zeros(self._schedules.shape[-1])
         for step in range(self._step, self._step + steps):
             delivered = self._schedules[step % len(self._schedules)]

@@ -1,4 +1,4 @@
-"""What a reference may plan with: the task's model from the present on, without what is hidden."""
+"""The planning model of a reference policy: the task's model without hidden quantities."""
 
 from itertools import product
 
@@ -14,7 +14,7 @@ from fusion_gym.policies.belief_rule import beliefs_of
 
 
 def transmission_sets(task: Task) -> NDArray[np.bool_]:
-    """Every set of sensors that may transmit in one step, (sets, sensors) bool, silence first."""
+    """Return every set of sensors that may transmit together (sets, sensors), silence first."""
     if task.access == "single":
         nobody = np.zeros((1, task.sensors), dtype=np.bool_)
         return np.concatenate((nobody, np.eye(task.sensors, dtype=np.bool_)[::-1]))
@@ -22,13 +22,13 @@ def transmission_sets(task: Task) -> NDArray[np.bool_]:
 
 
 class PlanningModel:
-    """The task's own moves from the signals of one step on, for N runs.
+    """The task's model from the signals of one step on, for N runs.
 
-    It knows what a scheduler knows: all new measurements, what the nodes and the centre hold,
-    the tokens, and with memory all that was measured and not sent. It has neither the true state
-    nor what the channel is about to lose.
+    It has the knowledge of a scheduler: all new measurements, the states of nodes and centre, the
+    tokens, and with memory all unsent measurements. It has neither the true state nor the coming
+    losses.
 
-    ``arrival`` (sensors, N) is the probability that a packet sent now arrives; None: surely.
+    ``arrival`` (sensors, N) is the probability that a packet arrives; None for a lossless network.
     """
 
     def __init__(self, task: Task, signals: Signals) -> None:
@@ -47,18 +47,19 @@ class PlanningModel:
         return len(self._tokens)
 
     def grant(self, requests: NDArray[np.bool_]) -> Grants:
-        """What the network would answer to requests (sensors, N) now.
-
-        With ``access="single"`` there must be at most one a run.
-        """
+        """Return the network's answer to requests (sensors, N) now."""
         admitted = requests & self._admitted
         return self._task.bucket.grant(self._tokens, admitted, self._step, self._queue)
 
     def fused_means(self, arriving: NDArray[np.bool_], steps: int) -> Array:
-        """Fused means (steps, n, N) if these packets (sensors, N) arrive now.
+        """Return the predicted fused means (steps, n, N) after a delivery of these packets.
 
-        After that nothing is transmitted and no noise acts: the expectation of a linear system.
-        With ``packet="estimate"`` they bring the best estimate there is.
+        After the delivery nothing is transmitted and no noise acts, which gives the expectation of
+        a linear system. With ``packet="estimate"`` a packet contains the best estimate.
+
+        Args:
+            arriving: delivered packets (sensors, N).
+            steps: number of steps.
         """
         system = self._task.system
         delivered = system.deliver(self._state, arriving)
@@ -68,7 +69,7 @@ class PlanningModel:
         return silent_path(system, delivered, steps)
 
     def best_means(self, steps: int) -> Array:
-        """The same of the estimate that holds all that was measured, with memory ever."""
+        """Return the predicted means (steps, n, N) of the best estimate, from all measurements."""
         memory_system = self._task.memory_system
         if memory_system is None or self._beliefs is None:
             return self.fused_means(np.ones((self._task.sensors, self.runs), np.bool_), steps)

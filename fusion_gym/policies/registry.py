@@ -1,8 +1,8 @@
-"""Every policy by its name: rules, references that know the model, saved agents.
+"""The registry of policies: rules, references and saved agents by name.
 
-A policy is asked for as ``NAME`` or ``NAME:key=value,key=value``, a saved agent as ``model:PATH``
-or ``zoo:NAME`` with settings behind a comma, one of your own as ``package.module:Class`` or
-``package.module:Class:key=value``.
+The text ``NAME`` or ``NAME:key=value,key=value`` names a policy. ``model:PATH`` or ``zoo:NAME``
+names a saved agent, with settings after a comma. ``package.module:Class`` or
+``package.module:Class:key=value`` names a class of the user.
 """
 
 import importlib
@@ -27,21 +27,22 @@ Maker = Callable[..., Policy]
 
 
 class Context(TypedDict):
-    """What whoever asks for a policy gives to its maker, and its text never does."""
+    """The arguments of a maker that the text of a policy cannot set."""
 
     task: Task
     trust: bool
 
 
 class PolicyRow(NamedTuple):
-    """A policy's maker: a callable, or where to import it, as "module:attribute"; and its kind.
+    """The maker of a policy, as a callable or as "module:attribute", and its kind.
 
-    The maker takes the policy's parameters by name, the task if it has a parameter ``task``, and
-    whether files may run code if it has a parameter ``trust``. Its docstring declares the policy.
-    An attribute ``rest`` names the parameter that takes all the text behind it, for it may hold
-    colons and commas. ``None`` is the kind of the maker: a function makes an agent, whose first
-    parameter is the text behind its name; a class with a parameter ``task`` is a reference, which
-    takes the task and its model; another is a rule, which looks at signals alone.
+    The maker takes the parameters of the policy by name. A parameter ``task`` receives the task,
+    and a parameter ``trust`` whether files may run code. Its docstring declares the policy. An
+    attribute ``rest`` names the parameter that takes the rest of the text, which may contain colons
+    and commas.
+
+    Without a kind, a function makes an agent, with the text after its name as its first parameter.
+    A class with a parameter ``task`` is a reference, and any other class is a rule.
     """
 
     maker: Maker | str
@@ -83,15 +84,25 @@ _ROWS: dict[str, PolicyRow] = {
 
 
 def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
-    """Make a policy of your own known by a name, wherever policies are named.
+    """Register a policy under a name for texts, commands and configs.
 
-    ``maker(**parameters)`` returns the policy, for example a class derived from
-    :class:`fusion_gym.policies.base.Rule`; if it has a parameter ``task`` it is given the task,
-    and with a parameter ``trust`` what :func:`make_policy` is given. Its other parameters are those
-    that ``name:key=value`` may set.
+    Args:
+        name: name of the policy, a word of letters, digits and ``_``.
+        maker: callable that returns the policy, for example a subclass of
+            :class:`fusion_gym.policies.base.Rule`. A text may set its parameters, except ``task``
+            and ``trust``, which receive the arguments of :func:`make_policy`.
+        kind: ``"rule"``, ``"reference"`` or ``"agent"``.
 
     Raises:
-        ConfigurationError: a name that exists or cannot be written, or no callable.
+        ConfigurationError: a name that exists or is not allowed, an unknown kind, or a maker that
+            is no callable with named parameters.
+
+    Example:
+        >>> from fusion_gym import policy_names, register_policy
+        >>> from fusion_gym.policies.rules.periodic import Periodic
+        >>> register_policy("clocked", Periodic)
+        >>> "clocked" in policy_names("rule")
+        True
     """
     if not isinstance(name, str) or not name.isidentifier():
         raise refusal("name", name, "a word of letters, digits and '_'")
@@ -103,10 +114,21 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
 
 
 def policy_names(kind: Kind | None = None) -> list[str]:
-    """Names of all policies, or of those of a kind: "rule", "reference" or "agent".
+    """Return the names of all policies, or of the policies of one kind.
+
+    Args:
+        kind: ``"rule"``, ``"reference"`` or ``"agent"``; None for all.
+
+    Returns:
+        The names in alphabetical order.
 
     Raises:
         ConfigurationError: an unknown kind.
+
+    Example:
+        >>> from fusion_gym import policy_names
+        >>> policy_names("agent")
+        ['model', 'zoo']
     """
     if kind is not None:
         choice("kind", kind, get_args(Kind))
@@ -114,21 +136,13 @@ def policy_names(kind: Kind | None = None) -> list[str]:
 
 
 def policy_maker(name: str) -> Maker:
-    """Return what makes the policy of this name; its docstring declares the policy.
-
-    Raises:
-        ConfigurationError: an unknown name.
-    """
+    """Return the maker of the policy of this name."""
     keys("policy", [name], _ROWS)
     return _maker(_ROWS[name])
 
 
 def policy_parameters(name: str) -> dict[str, inspect.Parameter]:
-    """Return the parameters that a text may set, in the maker's order.
-
-    Raises:
-        ConfigurationError: an unknown name.
-    """
+    """Return the parameters that a text may set, in the maker's order."""
     return _parameters(name, policy_maker(name))
 
 
@@ -144,19 +158,32 @@ def policy_table(kind: Kind) -> str:
 
 
 def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
-    """The policy that ``NAME`` or ``NAME:key=value,…`` names, tried out on one run of the task.
+    """Return the policy of a text, after a trial call on one run of the task.
 
-    Parameters that the text does not set are the task's own (``task.policy_defaults``) or the
-    maker's. ``trust`` lets ``model:PATH`` run code that the file holds: without it a file is data.
+    Parameters that the text does not set have the task's defaults (``task.policy_defaults``) or the
+    maker's defaults.
+
+    Args:
+        spec: text of the policy, ``NAME`` or ``NAME:key=value,…``.
+        task: the task, for example of :func:`~fusion_gym.make_task`.
+        trust: whether ``model:PATH`` may run code of the file; otherwise the file is read as data.
+
+    Returns:
+        The policy, a function from signals to requests.
 
     Raises:
         ConfigurationError: an unknown policy or parameter, a value that is not allowed, a model
-            that cannot be read or was trained for another observation layout, or a policy that
-            looks at signals which the task withholds.
+            that cannot be read or has another observation layout, or a policy that uses signals
+            which the task withholds.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> make_policy("send_on_delta:threshold=2", make_task("fusion_gym/TobitOscillator-v1"))
+        SendOnDelta(threshold=2)
     """
     context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)
-    if _kind(_asked(spec)[1]) != "agent":  # loading it has checked all that it sees
+    if _kind(_asked(spec)[1]) != "agent":  # the loader has checked its observation
         _try_out(spec, policy, task)
     return policy
 
@@ -195,18 +222,14 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
 
 
 def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:
-    """The settings before the parameter that takes the rest of the text, and that one."""
+    """Return the text before the parameter ``rest``, and the value of that parameter."""
     if rest is not None and (result := re.search(rf"(^|,)\s*{rest}=", text)):
         return text[: result.start()], {rest: text[result.end() :]}
     return text, {}
 
 
 def _asked(spec: str) -> tuple[str, PolicyRow, str]:
-    """The name of a policy, its row, and the text behind its name.
-
-    Raises:
-        ConfigurationError: an unknown name, or a class that cannot be imported or is no policy.
-    """
+    """Return the name of a policy, its row, and the text after its name."""
     if not isinstance(spec, str):
         raise refusal("policy", spec, "the text that names a policy")
     name, _, text = spec.partition(":")
@@ -244,11 +267,7 @@ def _kind(row: PolicyRow) -> Kind:
 
 
 def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:
-    """All but the task and the trust, in the maker's order.
-
-    Raises:
-        ConfigurationError: no callable whose parameters have names.
-    """
+    """Return all parameters but the task and the trust, in the maker's order."""
     try:
         names = inspect.signature(maker).parameters
     except (TypeError, ValueError):
@@ -266,7 +285,7 @@ def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:
 
 
 def _try_out(spec: str, policy: Policy, task: Task) -> None:
-    """One call on one run, so that a misfit is told before anything long begins."""
+    """Call the policy once on one run, to report errors before long work begins."""
     batch = EpisodeBatch(task, 1, owner_of(policy))
     batch.reset()
     policy.reset(1)

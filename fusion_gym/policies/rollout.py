@@ -1,4 +1,4 @@
-"""One improvement on a policy: try first decisions, and let it go on, in simulations."""
+"""A reference policy that improves a base policy by simulations of its first decisions."""
 
 from typing import ClassVar
 
@@ -16,41 +16,43 @@ from fusion_gym.policies.belief_rule import check_owner, knows
 from fusion_gym.policies.imagination import Imagination
 from fusion_gym.policies.registry import make_policy
 
-_STREAM = 0x726F6C6C6F7574  # keeps what is imagined apart from the noise of the same seed
+_STREAM = 0x726F6C6C6F7574  # makes simulations independent of the noise of the same seed
 _SAMPLES, _STEPS = 1000, 200  # at most
-_LANES = 16384  # simulations side by side, unless those of one run are more
+_LANES = 16384  # simulations in one batch, unless one run needs more
 
 
 class Rollout:
-    r"""Request what is best in simulations in which the policy ``base`` goes on.
+    r"""Request the best first decision in simulations that continue with the policy ``base``.
 
-    At every step it tries, as first decisions, nobody, each sensor alone and what the base asks
-    for; after each the base goes on for ``steps`` more, in ``samples`` simulations. They begin with
-    what is believed (:meth:`~fusion_gym.core.system.System.imagine`), have noise of their own,
-    the same for every decision, and know neither the truth nor coming noise and losses. The
-    decision of the least mean cost is taken, of those that beat the base's own by ``doubt``
-    standard errors of their difference; with 0 it is the least cost itself, whose chance finds
-    make it send too often. A simulation does not end with the episode.
+    At every step the first decisions are silence, each single sensor, and the base's requests.
+    After each of them the base continues for ``steps`` steps, in ``samples`` simulations. The
+    simulations start from the beliefs (:meth:`~fusion_gym.core.system.System.imagine`) and draw
+    their own noise, the same for every decision; they use neither the truth nor the coming noise
+    and losses. The rule takes the decision of the least mean cost among the decisions that beat the
+    base's decision by ``doubt`` standard errors of the difference. With ``doubt=0`` it takes the
+    least cost; random differences then make it transmit too often. A simulation does not end with
+    the episode.
 
-    The cost is error_weight · ‖x* - x̂‖² + ``price`` for each token (None: the task's own), with x*
-    the best estimate that could be made at that step and the reward's weights. Where x* is the
-    conditional mean, that is the expected squared error but for a part that no decision changes.
+    The cost is error_weight · ‖x* - x̂‖² + ``price`` for each token, with the reward's weights and
+    x* the best estimate at that step. If x* is the conditional mean, the cost is the expected
+    squared error minus a part that no decision changes.
 
-    With ``samples`` and ``steps`` without limit, on a model that is true, it would cost no more
-    than its base: where one improvement brings little, the base is nearly the best of those near
-    it. It does samples · (steps + 1) · (sensors + 1) steps of the base for one of its own.
+    With infinite ``samples`` and ``steps`` and a true model, its cost is at most the base's cost.
+    One step takes samples · (steps + 1) · (sensors + 1) steps of the base.
 
     Args:
-        base: policy that is improved; the text behind ``base=`` is all its own.
+        task: the task; a text cannot set it.
+        base: policy that is improved; it takes the whole text after ``base=``.
         samples: M >= 1, simulations of each decision.
         steps: h >= 1, steps of the base after a decision.
         price: p >= 0 of a token; None for the task's own.
         doubt: standard errors by which a decision must beat the base's.
+        trust: whether a base ``model:PATH`` may run code of its file; a text cannot set it.
 
     Raises:
-        ConfigurationError: a number that is not allowed; a base that cannot be made, that keeps
-            variables of its own from step to step, or that looks at each sensor's own beliefs; a
-            task whose policies do not see the sensors, or whose system cannot be imagined.
+        ConfigurationError: a number that is not allowed; a base that cannot be made, that has
+            variables, or that uses each sensor's own beliefs; a task whose policies do not see the
+            sensors, or whose system cannot draw its hidden parts.
 
     Equation:
         $$
@@ -58,12 +60,12 @@ class Rollout:
         x_m(t+k)\rVert_W^2+p\,C_m(t+k)\right)
         $$
 
-        The first decision a is nobody, one sensor, or what the base asks for; after it the base
-        goes on. m counts the ``samples`` M, h is ``steps``, C are the tokens spent, p is ``price``,
-        W the weights of the reward's error term. Another decision than the base's must be better by
-        ``doubt`` standard errors of the difference.
+        The first decision a is silence, one sensor, or the base's requests; after it the base
+        continues. m counts the ``samples`` M, h is ``steps``, C are the tokens spent, p is
+        ``price``, W the weights of the reward's error term. A decision other than the base's must
+        be better by ``doubt`` standard errors of the difference.
 
-    Assumes: a model that is true, for what is imagined comes of it.
+    Assumes: a model that is true, since the simulations use it.
 
     Source: D. P. Bertsekas, J. N. Tsitsiklis and C. Wu, "Rollout algorithms for combinatorial
     optimization", Journal of Heuristics 3, 1997.
@@ -116,18 +118,18 @@ class Rollout:
 
     @property
     def knowledge(self) -> Knowledge:
-        """A scheduler, with what was never sent if the task has memory."""
+        """The class of a scheduler, with memory if the task has memory."""
         return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Begin again: run i imagines with a stream of its own, that of ``seed + i``."""
+        """Restart the random streams; run i simulates with the stream of ``seed + i``."""
         self.base.reset(runs, seed)
         self._generators = [
             np.random.default_rng([item, _STREAM]) for item in range(seed, seed + runs)
         ]
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         runs = len(signals["tokens"])
         if len(self._generators) != runs:
             self.reset(runs)
@@ -141,8 +143,7 @@ class Rollout:
         return np.ascontiguousarray(choices[best, :, np.arange(runs)].T)
 
     def _choices(self, own: Requests) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """First decisions (choices, sensors, N), nobody and each sensor alone before the base's
-        ``own``, and which of them is the base's (N,)."""
+        """Return first decisions (choices, sensors, N) and the number of the base's (N,)."""
         sensors, runs = own.shape
         single = np.concatenate(
             (np.zeros((1, sensors), dtype=np.bool_), np.eye(sensors, dtype=np.bool_))
@@ -154,7 +155,7 @@ class Rollout:
         return choices, np.where(several, sensors + 1, own.any(0) * (1 + own.argmax(0)))
 
     def _least(self, cost: Array, own: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Which decision to take (R,), from costs (choices, R, samples) and the base's (R,)."""
+        """Return the decision (R,), from costs (choices, R, samples) and the base's (R,)."""
         gain = cost[own, np.arange(len(own))] - cost
         error = gain.std(-1) / np.sqrt(self.samples)
         mean = gain.mean(-1)
@@ -163,7 +164,7 @@ class Rollout:
         return np.where(worth.max(0) > 0.0, result, own)
 
     def _cost(self, signals: Signals, runs: NDArray[np.int64], choices: NDArray[np.bool_]) -> Array:
-        """Costs (choices, R, samples) of first decisions (choices, sensors, R) in these runs."""
+        """Return costs (choices, R, samples) of first decisions (choices, sensors, R)."""
         count, samples = len(choices), self.samples
         drawn = self._imagination.channels(self.steps)
         normals = np.stack(

@@ -13,12 +13,14 @@ def saved_agent(
     *,
     trust: bool = False,
 ) -> Policy:
-    """Request as a Stable-Baselines3 model does that is saved in a file; torch is imported here.
+    """Request as a Stable-Baselines3 model that is saved in a file.
 
     Args:
+        task: the task; a text cannot set it.
         path: the file, with or without ``.zip``.
-        deterministic: take the likeliest action in the place of a draw.
-        price: of a token, for an agent that was trained for a range of prices.
+        deterministic: take the likeliest action instead of a draw.
+        price: price of a token, for an agent that was trained for a range of prices.
+        trust: whether the file may run code; a text cannot set it.
 
     Raises:
         ConfigurationError: as :func:`fusion_gym.policies.loading.load_model_policy`.
@@ -31,15 +33,16 @@ def saved_agent(
 def zoo_agent(
     task: Task, name: str, deterministic: bool = True, price: float | None = None
 ) -> Policy:
-    """Request as an agent of the model zoo does, :mod:`fusion_gym.zoo`.
+    """Request as an agent of the model zoo (:mod:`fusion_gym.zoo`).
 
     Args:
-        name: the agent's.
-        deterministic: take the likeliest action in the place of a draw.
-        price: of a token, for an agent that was trained for a range of prices.
+        task: the task; a text cannot set it.
+        name: name of the agent.
+        deterministic: take the likeliest action instead of a draw.
+        price: price of a token, for an agent that was trained for a range of prices.
 
     Raises:
-        ConfigurationError: no agent of that name, one whose file is not what its card says, or one
+        ConfigurationError: no agent of that name, a file that differs from its card, or an agent
             that does not fit the task.
     """
     return saved_agent(task, zoo.model_path(name), deterministic, price)

@@ -1,4 +1,4 @@
-"""Searched schedules in a file, found again by all that they depend on."""
+"""Store searched schedules in a file, by a hash of everything that determines them."""
 
 import dataclasses
 import hashlib
@@ -21,17 +21,14 @@ _FORMAT = 2
 
 
 class Schedule(NamedTuple):
-    """Requests (period, sensors) bool, row 0 for the first step of an episode, and their trace.
-
-    ``trace`` is the plain trace of the fused error's covariance, averaged over time.
-    """
+    """Requests (period, sensors) bool from the start of an episode, and their mean ``trace``."""
 
     requests: Patterns
     trace: float
 
 
 def schedule_key(system: System[Any], packets: int, period: int, steps: int | None) -> str:
-    """Hash of the system's type and all its numbers, and of what is asked for."""
+    """Return a hash of the system's type, of its numbers and of the arguments of the search."""
     digest = hashlib.sha256()
     key_fields = (_FORMAT, __version__, packets, period, steps)
     digest.update(repr(key_fields).encode())
@@ -42,7 +39,7 @@ def schedule_key(system: System[Any], packets: int, period: int, steps: int | No
 def load_schedule(
     cache: str | None, key: str, packets: int, shape: tuple[int, int]
 ) -> Schedule | None:
-    """The file's schedule, if it has one that can be true."""
+    """Return the schedule of the file, if it has a plausible one."""
     if cache is None:
         return None
     entry = _read(Path(cache)).get(key)
@@ -59,11 +56,7 @@ def load_schedule(
 
 
 def store_schedule(cache: str, key: str, schedule: Schedule) -> None:
-    """Put the schedule into the file, which is replaced as a whole or not at all.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
+    """Write the schedule into the file, which is replaced as a whole or not at all."""
     path = Path(cache)
     entry = {"requests": schedule.requests.astype(int).tolist(), "trace": schedule.trace}
     entries = _read(path)
@@ -101,7 +94,7 @@ def _feed(digest: Any, value: Any) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The file's entries; none if it is missing, broken or of another kind."""
+    """Return the entries of the file; none if it is missing, broken or of another kind."""
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))["periodic_optimum"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,4 +1,4 @@
-"""Settings as a command line writes them: ``key=value,key=value``."""
+"""Settings of a command line: ``key=value,key=value``."""
 
 import ast
 import contextlib
@@ -9,10 +9,7 @@ from fusion_gym.validation import ConfigurationError
 
 
 def parse_value(text: str) -> Any:
-    """A number, true, false, none, inf, or a list as Python writes it; all else stays text.
-
-    Values for several sensors may also be written with slashes: ``0.1/0.2/0.3``.
-    """
+    """Return the number, keyword, list or ``0.1/0.2/0.3`` of a text, or else the text."""
     plain = {"true": True, "false": False, "none": None, "null": None}
     if text.strip().lower() in plain:
         return plain[text.strip().lower()]
@@ -21,18 +18,14 @@ def parse_value(text: str) -> Any:
         if all(isinstance(part, (int, float)) for part in parts):
             return parts
     for read in (ast.literal_eval, float):
-        # Of what is no literal: {[]: 1} raises a TypeError, too many brackets the last two.
+        # {[]: 1} raises a TypeError, too many brackets the last two.
         with contextlib.suppress(ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
             return read(text)
     return text
 
 
 def parse_settings(kind: str, entries: Iterable[str]) -> dict[str, Any]:
-    """``["key=value", …]`` as a dictionary, with :func:`parse_value`.
-
-    Raises:
-        ConfigurationError: an entry without ``=``, or a key given twice.
-    """
+    """Return ``["key=value", …]`` as a dictionary, with :func:`parse_value`."""
     result: dict[str, Any] = {}
     for entry in entries:
         key, equals, value = entry.partition("=")

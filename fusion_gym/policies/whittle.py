@@ -1,4 +1,4 @@
-"""Whittle's index of remote estimation: what a transmission of each source is worth by itself."""
+"""Whittle's index of remote estimation: the value of a transmission of each single source."""
 
 from typing import ClassVar
 
@@ -17,15 +17,17 @@ from fusion_gym.solvers.whittle import index_table
 class WhittleIndex:
     r"""Request the sources whose Whittle index reaches the price of a transmission.
 
-    The index of a source with error e and channel state s is the price λ at which its own optimum
-    does not care whether it transmits. With thresholds that grow with the price it is the inverse
-    of λ ↦ k(s; λ); the thresholds are solved at 32 prices and interpolated. For one source and a
-    fixed price the rule is the stationary optimum; for many sources that share a network it is
-    Whittle's heuristic, which is asymptotically optimal in similar problems and not in general.
+    The index of a source with error e and channel state s is the price λ at which transmission and
+    silence cost its single optimum the same. If the thresholds grow with the price, the index is
+    the inverse of λ ↦ k(s; λ); the thresholds are solved at 32 prices and interpolated. For one
+    source and a fixed price the rule is the stationary optimum. For several sources that share a
+    network it is Whittle's heuristic, which is asymptotically optimal in similar problems but not
+    in general.
 
-    With a price of zero it requests the sources of the highest index.
+    At a price of zero it requests the sources of the highest index.
 
     Args:
+        task: the task; a text cannot set it.
         price: p >= 0 of a token; None for the task's own.
         at_most: most sources requested in a step; None: one with ``access="single"``, else all.
 
@@ -39,11 +41,11 @@ class WhittleIndex:
         \lambda_i(e_i)/c_i\ge p
         $$
 
-        kᵢ(λ) is the optimal threshold of source i by itself at the price λ of a transmission, for
-        the channel's last state; p is ``price``, c the tokens that a transmission costs. Of those,
-        the ``at_most`` of the highest index per token.
+        kᵢ(λ) is the optimal threshold of the single source i at the price λ of a transmission, for
+        the channel's last state; p is ``price``, c the tokens of a transmission. With ``at_most``,
+        the sources of the highest index per token.
 
-    Assumes: sources that are independent of one another, with |a| <= 1, whose model is true.
+    Assumes: independent sources with |a| <= 1, whose model is true.
 
     Source: P. Whittle, "Restless bandits: activity allocation in a changing world", Journal of
     Applied Probability 25A, 1988.
@@ -64,21 +66,23 @@ class WhittleIndex:
 
     @property
     def knowledge(self) -> Knowledge:
-        """A sensor's own error; with ``at_most`` all errors, for the largest index is sent."""
+        """The class of a sensor, or with ``at_most``, which compares sources, of a scheduler."""
         return "own" if self._at_most is None else "scheduler"
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Nothing to forget."""
+        """Do nothing; the policy has no memory."""
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         index = self.index(signals["innovation"][:, 0], signals["channel_state"]) / self._cost
         return strongest(index, index >= self._price, self._at_most, signals["age"])
 
     def index(self, error: Array, channel: NDArray[np.int64]) -> Array:
-        """Price of a transmission (sensors, N) at which each source is indifferent.
+        """Return the price of a transmission (sensors, N) at which each source is indifferent.
 
-        From errors (sensors, N) and channel states (sensors, N).
+        Args:
+            error: errors of the sources (sensors, N).
+            channel: channel states (sensors, N).
         """
         result = np.empty(error.shape)
         for source, (prices, thresholds) in enumerate(self._tables):
@@ -86,8 +90,8 @@ class WhittleIndex:
             for state, reached in enumerate(thresholds.T):
                 here = channel[source] == state
                 inside = np.interp(size[here], reached, prices)
-                # Beyond the table the index grows as the square of the error, which it does for
-                # small errors exactly.
+                # Outside the table the index grows as the square of the error, which is exact
+                # for small errors.
                 scale = np.clip(size[here], None, reached[0]) / reached[0]
                 beyond = np.maximum(size[here] / reached[-1], 1.0)
                 result[source, here] = inside * scale**2 * beyond**2

@@ -1,4 +1,4 @@
-"""Solvers: the optimal cost of remote estimation by dynamic programming, and bounds on it."""
+"""The optimal cost of remote estimation by dynamic programming, and bounds on it."""
 
 from fusion_gym.solvers.ages import AgeSolution, solve_ages
 from fusion_gym.solvers.bounds import DualBound, lagrangian_bound

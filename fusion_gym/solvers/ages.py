@@ -1,4 +1,4 @@
-"""Several sources, scheduled by their ages alone: the best that ignores the errors can do."""
+"""Optimal schedules of several sources by their ages, without use of the errors."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ from fusion_gym.solvers.iteration import iterate_values
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
-_LAZINESS = 0.3  # share of the old value that is kept: optimal schedules are periodic
+_LAZINESS = 0.3  # weight of the old value, because optimal schedules are periodic
 _MOST_STATES = 300_000
 _TOLERANCE, _ITERATIONS = 1e-8, 100_000
 
 
 @dataclass(frozen=True)
 class AgeSolution:
-    """The least average cost a step, between ``lower`` and ``upper``.
+    """The least average cost per step, between ``lower`` and ``upper``.
 
     ``choice`` (A, ..., A) is the set of sources to transmit, as bits, by their ages 1 to A.
     """
@@ -30,7 +30,7 @@ class AgeSolution:
 
 
 def silent_variances(problem: SourceProblem, longest: int) -> Array:
-    """Variance (longest,) of an error of age 1 to ``longest``: σ² (1 + a² + … + a^(2(age-1)))."""
+    """Return the variances of errors of the ages k = 1, 2, …: σ² (1 + a² + … + a^(2(k-1)))."""
     with np.errstate(over="ignore"):
         powers = problem.coefficient ** (2.0 * np.arange(longest))
     return problem.deviation**2 * np.cumsum(powers)
@@ -41,11 +41,15 @@ def solve_ages(
     at_most: int | None = None,
     longest: int | None = None,
 ) -> AgeSolution:
-    """Least average cost of policies that know ages and losses only, by relative value iteration.
+    """Return the least average cost of policies that use only ages and losses.
 
-    At most ``at_most`` sources transmit in a step (None: any number). The problems' token levels
-    are ignored. Ages beyond ``longest`` count as ``longest``; the default leaves room for four
-    times the best period.
+    The method is relative value iteration. The problems' token levels are ignored.
+
+    Args:
+        problems: the sources.
+        at_most: largest number of transmissions in a step; None for no limit.
+        longest: largest age, which also stands for all larger ages; by default about four times the
+            best period.
 
     Raises:
         ConfigurationError: more than one channel state, more than 300,000 combinations of ages or
@@ -86,7 +90,7 @@ def _default_length(problem: SourceProblem, sharing: float) -> int:
 
 
 def _step_cost(problems: tuple[SourceProblem, ...], size: int, choice: int) -> Array:
-    """Expected cost of a step (A, ..., A) in which the sources ``choice`` transmit."""
+    """Return the expected cost (A, ..., A) of a step in which the sources ``choice`` transmit."""
     total = np.zeros((size,) * len(problems))
     for i, problem in enumerate(problems):
         cost = problem.error_weight * silent_variances(problem, size)
@@ -99,7 +103,7 @@ def _step_cost(problems: tuple[SourceProblem, ...], size: int, choice: int) -> A
 
 
 def _ahead(problems: tuple[SourceProblem, ...], value: Array, choice: int) -> Array:
-    """Expected value of the ages that follow."""
+    """Return the expected value of the next ages."""
     for i, problem in enumerate(problems):
         size = value.shape[i]
         older = value.take(np.minimum(np.arange(size) + 1, size - 1), axis=i)

@@ -1,4 +1,4 @@
-"""A lower bound for many sources that share tokens: each on its own, at a common price."""
+"""A lower bound for many sources that share tokens, by independent optima at a common price."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,12 +12,12 @@ from fusion_gym.solvers.single import solve_average, solve_finite
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
-_TOLERANCE = 1e-3  # of the multiplier, relatively: the bound is flat there
+_TOLERANCE = 1e-3  # relative, of the multiplier; the bound is flat at its maximum
 _DOUBLINGS = 60
 
 
 class DualBound(NamedTuple):
-    """No policy costs less than ``cost``; ``multiplier`` is the price of a token that shows it."""
+    """A lower bound ``cost`` of every policy, and its ``multiplier``, the price of a token."""
 
     cost: float
     multiplier: float
@@ -31,17 +31,24 @@ def lagrangian_bound(
     initial_tokens: float = 0.0,
     initial_deviation: Sequence[float] | None = None,
 ) -> DualBound:
-    """What no policy of these sources can undercut that spends ``rate`` tokens a step or fewer.
+    """Return a lower bound of the cost of policies that spend at most ``rate`` tokens per step.
 
-    For every multiplier μ >= 0, the sum of the sources' own optima at the prices
-    price + μ · spent, less μ times the tokens there are, is a lower bound (weak duality); the
-    largest is returned. ``spent`` are the tokens of one transmission; one transmission a step
-    (``access="single"``) is a rate of 1 with ``spent`` of 1. The problems' own tokens must be
-    unlimited.
+    A multiplier μ >= 0 gives the lower bound Σᵢ Jᵢ(priceᵢ + μ · spentᵢ) - μ · supply by weak
+    duality, where Jᵢ is the optimal cost of source i at a price. The function returns the largest
+    of these bounds. One transmission per step (``access="single"``) is a rate of 1 with ``spent``
+    of 1.
 
-    With ``horizon`` the cost is that of an episode, whose channels start in the problems' own
-    ``initial`` laws and for which there are ``initial_tokens`` and ``rate`` after every step but
-    the last; otherwise it is the average a step.
+    Without ``horizon`` the cost is the average per step, and the supply is ``rate``. With
+    ``horizon`` the cost is the sum over an episode, whose channels start in the problems'
+    ``initial`` laws. Its supply is ``initial_tokens`` + ``rate`` · (``horizon`` - 1).
+
+    Args:
+        problems: the sources; their own tokens must be unlimited.
+        spent: tokens of a transmission of each source.
+        rate: tokens per step.
+        horizon: number of steps; None for the average cost.
+        initial_tokens: tokens at the start of an episode.
+        initial_deviation: standard deviation of x(0) of each source; 0 by default.
 
     Raises:
         ConfigurationError: a value that is not allowed.

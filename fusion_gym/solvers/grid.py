@@ -1,4 +1,4 @@
-"""The error of one source on a grid: its transition as a matrix."""
+"""The error of one source on a grid, with its transition as a matrix."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _MOST_POINTS = 1500
 class ErrorGrid:
     """Absolute errors 0, h, 2h, … and the matrix of E[V(a e + w)] for even functions V.
 
-    The Gaussian density is sampled at the grid's points. By Poisson's summation formula a row
-    then sums to 1, and has the mean and the variance of the Gaussian, to 2 exp(-2π² σ²/h²): no
-    error but that of V's kinks, of order h². What lies beyond the last point is added to it;
+    The Gaussian density is sampled at the grid's points. By Poisson's summation formula a row then
+    has the sum 1 and the mean and variance of the Gaussian, up to 2 exp(-2π² σ²/h²). The remaining
+    error is due to the kinks of V, of order h². The last point has the probability beyond it, so
     ``kernel`` is a stochastic matrix.
 
     Shapes: ``points`` (M,), ``kernel`` (M, M) from the error after a delivery (row) to the next.
@@ -29,14 +29,14 @@ class ErrorGrid:
 
     @classmethod
     def create(cls, coefficient: float, deviation: float, reach: float, step: float) -> ErrorGrid:
-        """Errors up to ``reach`` in steps of ``step``, at least three and at most 1,500 points."""
+        """Return errors up to ``reach`` in steps of ``step``, from 3 to 1,500 points."""
         count = min(max(int(np.ceil(reach / step)) + 1, 3), _MOST_POINTS)
         points: Array = np.arange(count, dtype=np.float64) * float(step)
         return cls(points, gaussian_rows(coefficient * points, deviation, points))
 
 
 def gaussian_rows(mean: Array, deviation: float, points: Array) -> Array:
-    """Weights (R, M) of the points of |X|, X ~ N(mean, deviation²), mean (R,); rows sum to 1."""
+    """Return the weights (R, M) of the points of |X|, X ~ N(mean, deviation²); rows sum to 1."""
     step = points[1]
     scale = step / (deviation * np.sqrt(2.0 * np.pi))
     rows = np.exp(-0.5 * ((points - mean[:, None]) / deviation) ** 2)
@@ -47,7 +47,7 @@ def gaussian_rows(mean: Array, deviation: float, points: Array) -> Array:
 
 
 def silent_deviation(coefficient: float, deviation: float, steps: float) -> float:
-    """Deviation of the error after this many silent steps: σ √(1 + a² + … + a^(2(steps-1)))."""
+    """Return the error's deviation after silent steps: σ √(1 + a² + … + a^(2(steps-1)))."""
     square = coefficient**2
     if abs(square - 1.0) < 1e-9:
         return float(deviation * np.sqrt(steps))
@@ -66,12 +66,7 @@ def default_reach(
     horizon: int | None,
     negligible: float,
 ) -> float:
-    """An error that is exceeded with a ``negligible`` probability.
-
-    From the threshold on, silence lasts as long as packets are lost; ``wait`` is the number of
-    steps between two packets that the tokens allow. Within a horizon, no error exceeds what
-    silence from the start would bring.
-    """
+    """Return an error that is exceeded with a ``negligible`` probability."""
     tails = -float(ndtri(0.5 * negligible))
     persistence = float(np.abs(np.linalg.eigvals(transition * drop)).max())
     losses = np.inf if persistence >= 1.0 else 0.0

@@ -1,4 +1,4 @@
-"""Relative value iteration: the least average cost of a step, between bounds."""
+"""Relative value iteration: bounds of the least average cost of a step."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -18,13 +18,14 @@ def iterate_values(
     iterations: int,
     laziness: float = 0.0,
 ) -> tuple[float, float, ChoiceT]:
-    """Return bounds of the least average cost that are that close relatively, and the choice.
+    """Return bounds of the least average cost within a relative ``tolerance``, and the choice.
 
-    ``decide`` takes the values of the next step, and returns the present values and the choice;
-    ``laziness`` is the share of the old values that is kept.
-
-    Raises:
-        ConfigurationError: no convergence.
+    Args:
+        decide: function from the values of the next step to the present values and the choice.
+        shape: shape of the values.
+        tolerance: largest relative distance of the bounds.
+        iterations: largest number of iterations.
+        laziness: weight of the old values.
     """
     value, lower, upper = np.zeros(shape), 0.0, 0.0
     for _ in range(iterations):

@@ -23,10 +23,13 @@ _TOLERANCE, _ITERATIONS = 1e-6, 20_000  # of relative value iteration
 
 @dataclass(frozen=True)
 class JointProblem:
-    """Two sources whose channels lose packets independently, and what they share.
+    """Two sources whose channels lose packets independently, with a common network.
 
-    A source's own ``price`` is that of one of its transmissions, its own tokens are ignored.
-    ``tokens`` are the levels of the common bucket and ``at_most`` sources transmit in a step.
+    Args:
+        sources: the sources; ``price`` is the price of a transmission of the source, and its own
+            tokens are ignored.
+        tokens: levels of the common bucket.
+        at_most: largest number of transmissions in a step.
     """
 
     sources: tuple[SourceProblem, SourceProblem]
@@ -40,11 +43,7 @@ class JointProblem:
         bucket: TokenBucket | None = None,
         at_most: int = 2,
     ) -> JointProblem:
-        """Check the parts; without a bucket only ``at_most`` and the prices limit.
-
-        Raises:
-            ConfigurationError: not two sources, or more than one channel state.
-        """
+        """Return the checked problem; without a bucket the tokens are unlimited."""
         if len(sources) != 2:
             raise ConfigurationError(
                 f"sensors = {len(sources)} is not allowed for the joint optimum: it must be 2"
@@ -62,7 +61,7 @@ class JointProblem:
 
     @property
     def allowed(self) -> NDArray[np.bool_]:
-        """Which of the four sets of sources may be asked for at each level, (K, 4)."""
+        """The sets of sources that may be requested at each level (K, 4)."""
         small = np.array([selected.bit_count() <= self.at_most for selected in range(4)])
         return self.tokens.affordable & small
 
@@ -82,7 +81,7 @@ class JointProblem:
 
 
 class JointBellman:
-    """One step backwards in time; functions have the shape (M1, M2, K)."""
+    """One step of backward induction; functions have the shape (M1, M2, K)."""
 
     def __init__(self, problem: JointProblem, grids: tuple[ErrorGrid, ErrorGrid]) -> None:
         self.problem, self.grids = problem, grids
@@ -94,7 +93,7 @@ class JointBellman:
         self.shape = (len(first), len(two), len(problem.tokens.level))
 
     def decide(self, value: Array) -> tuple[Array, NDArray[np.int8]]:
-        """The least cost (M1, M2, K) and the set of sources that brings it, as bits."""
+        """Return the least cost (M1, M2, K) and the best set of sources, as bits."""
         first, second = self.grids
         ahead = (first.kernel @ value.reshape(self.shape[0], -1)).reshape(self.shape)
         remains = self.error_cost + np.matmul(second.kernel, ahead)
@@ -117,7 +116,7 @@ class JointBellman:
 
 @dataclass(frozen=True)
 class JointAverageSolution:
-    """The stationary optimum: ``cost`` a step, between ``lower`` and ``upper``.
+    """The stationary optimum: ``cost`` per step, between ``lower`` and ``upper``.
 
     ``choice`` (M1, M2, K) is the best set of sources, as bits, on the ``grids``.
     """
@@ -132,11 +131,7 @@ class JointAverageSolution:
 def solve_joint_average(
     problem: JointProblem,
 ) -> JointAverageSolution:
-    """Least average cost by relative value iteration, until its bounds agree to 1e-6 relatively.
-
-    Raises:
-        ConfigurationError: no convergence.
-    """
+    """Return the least average cost by relative value iteration, to a relative 1e-6."""
     bellman = JointBellman(problem, problem.grids())
     lower, upper, choice = iterate_values(bellman.decide, bellman.shape, _TOLERANCE, _ITERATIONS)
     return JointAverageSolution(0.5 * (lower + upper), lower, upper, choice, bellman.grids)
@@ -159,7 +154,7 @@ def solve_joint_finite(
     horizon: int,
     initial_deviation: tuple[float, float] = (0.0, 0.0),
 ) -> JointFiniteSolution:
-    """Least expected cost of ``horizon`` steps by dynamic programming."""
+    """Return the least expected cost of ``horizon`` steps by dynamic programming."""
     steps = validation.integer("horizon", horizon, at_least=1)
     bellman = JointBellman(problem, problem.grids(steps))
     value = np.zeros(bellman.shape)

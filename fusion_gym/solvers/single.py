@@ -1,8 +1,8 @@
-"""One source: the optimal cost and its thresholds by value iteration.
+"""The optimal cost of one source and its thresholds, by value iteration.
 
-Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
-Markovian state", IEEE Trans. Automatic Control 65, 2020 (the dynamic programme and the order of
-events); token levels are added to the state here.
+Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with Markovian
+state", IEEE Trans. Automatic Control 65, 2020 (the dynamic programme and the order of events); the
+token level is an additional state here.
 """
 
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from fusion_gym.solvers.source import SourceProblem
 
 
 class Bellman:
-    """One step backwards in time; functions have the shape (M, S, K).
+    """One step of backward induction; functions have the shape (M, S, K).
 
-    The axes are the absolute error before the decision, the channel state that was fed back, and
-    the token level.
+    The axes are the absolute error before the decision, the last channel state from the feedback,
+    and the token level.
     """
 
     def __init__(self, problem: SourceProblem, grid: ErrorGrid, discount: float = 1.0) -> None:
@@ -29,10 +29,14 @@ class Bellman:
         self.shape = (len(grid.points), len(problem.drop), len(problem.tokens.level))
 
     def choices(self, value: Array, error_cost: Array | float, price: float) -> tuple[Array, Array]:
-        """Costs (M, S, K) of silence and of a request, with ``value`` from the next step on.
+        """Return the costs (M, S, K) of silence and of a request.
 
-        ``error_cost`` is paid for the error that remains and zero where it is zero, ``price`` for
-        the request; one that the network would not grant costs infinity.
+        A request that the network would not grant has an infinite cost.
+
+        Args:
+            value: values of the next step (M, S, K).
+            error_cost: cost of the remaining error, 0 at the error 0.
+            price: cost of a request.
         """
         problem = self.problem
         silence, sending = problem.tokens.following.T
@@ -45,14 +49,18 @@ class Bellman:
         return silent, np.where(problem.tokens.affordable[:, 1], price + request, np.inf)
 
     def decide(self, value: Array) -> tuple[Array, Array]:
-        """The least cost (M, S, K), and by how much a request is better than silence."""
+        """Return the least cost (M, S, K), and the cost of silence minus the cost of a request."""
         silent, request = self.choices(value, self.error_cost, self.problem.price)
         return np.minimum(silent, request), silent - request
 
     def count(self, value: Array, threshold: Array) -> Array:
-        """Expected transmissions (M, S, K) under thresholds (S, K), ``value`` from the next step.
+        """Return the expected transmissions (M, S, K) under thresholds.
 
-        A point near the threshold counts as the share of its cell that lies above.
+        A point near the threshold counts as the share of its cell above the threshold.
+
+        Args:
+            value: expected transmissions from the next step on (M, S, K).
+            threshold: thresholds (S, K).
         """
         silent, request = self.choices(value, 0.0, 1.0)
         points = self.grid.points[:, None, None]
@@ -62,15 +70,20 @@ class Bellman:
 
 
 def _mix(weights: Array, value: Array) -> Array:
-    """Σ over s' of weights[s, s'] value[:, s', :]."""
+    """Return Σ over s' of weights[s, s'] value[:, s', :]."""
     rows = [sum(w * value[:, s] for s, w in enumerate(row)) for row in weights]
     return np.stack(rows, axis=1)
 
 
 def source_thresholds(advantage: Array, points: Array) -> tuple[Array, bool]:
-    """Where the advantage (M, ...) of a request becomes positive, and whether it then stays so.
+    """Return where the advantage of a request becomes positive, and whether it then stays so.
 
-    Interpolated between two points; infinite where it never does.
+    The threshold is interpolated between two points, and infinite if the advantage is never
+    positive.
+
+    Args:
+        advantage: cost of silence minus cost of a request (M, ...).
+        points: errors (M,).
     """
     asks = advantage >= 0.0
     first = np.argmax(asks, axis=0)
@@ -85,11 +98,16 @@ def source_thresholds(advantage: Array, points: Array) -> tuple[Array, bool]:
 
 @dataclass(frozen=True)
 class AverageSolution:
-    """The stationary optimum: ``cost`` a step, between ``lower`` and ``upper``.
+    """The stationary optimum.
 
-    ``error`` is the mean squared error and ``rate`` the transmissions a step; ``threshold`` (S, K)
-    by channel state and token level; ``ordered`` says whether a request is best at every larger
-    error too.
+    Args:
+        cost: cost per step, between ``lower`` and ``upper``.
+        lower: lower bound of the cost.
+        upper: upper bound of the cost.
+        error: mean squared error.
+        rate: transmissions per step.
+        threshold: thresholds (S, K) by channel state and token level.
+        ordered: whether a request is best at every error above its threshold.
     """
 
     cost: float
@@ -107,11 +125,16 @@ def solve_average(
     tolerance: float = 1e-7,
     iterations: int = 200_000,
 ) -> AverageSolution:
-    """Least average cost by relative value iteration, until its bounds are that close relatively.
+    """Return the least average cost by relative value iteration.
+
+    Args:
+        problem: the source.
+        grid: grid of the error; the problem's default grid by default.
+        tolerance: largest relative distance of the bounds.
+        iterations: largest number of iterations.
 
     Raises:
-        ConfigurationError: no convergence, for example of an unstable source whose packets are
-            lost too often.
+        ConfigurationError: no convergence, for example for an unstable source with frequent losses.
     """
     bellman = Bellman(problem, grid or problem.grid())
     lower, upper, advantage = iterate_values(bellman.decide, bellman.shape, tolerance, iterations)
@@ -123,7 +146,7 @@ def solve_average(
 
 
 def _rate(bellman: Bellman, threshold: Array, tolerance: float, iterations: int) -> float:
-    """Transmissions a step under stationary thresholds."""
+    """Return the transmissions per step under stationary thresholds."""
     value, change = np.zeros(bellman.shape), np.zeros(bellman.shape)
     for _ in range(iterations):
         new = bellman.count(value, threshold)
@@ -136,10 +159,10 @@ def _rate(bellman: Bellman, threshold: Array, tolerance: float, iterations: int)
 
 @dataclass(frozen=True)
 class DiscountedSolution:
-    """The discounted optimum, from a zero error on, with the initial tokens.
+    """The discounted optimum, from a zero error, with the initial tokens.
 
-    ``cost`` (S,) by the channel's state at time 0 is (1 - β) E Σ βᵗ cost(t), the cost of the first
-    step undiscounted; ``threshold`` (S, K) and ``ordered`` as in :class:`AverageSolution`.
+    ``cost`` (S,) by the channel's state at time 0 is (1 - β) E Σ βᵗ cost(t), where the first step
+    is not discounted. ``threshold`` (S, K) and ``ordered`` are as in :class:`AverageSolution`.
     """
 
     cost: Array
@@ -150,7 +173,13 @@ class DiscountedSolution:
 def solve_discounted(
     problem: SourceProblem, discount: float, grid: ErrorGrid | None = None, tolerance: float = 1e-10
 ) -> DiscountedSolution:
-    """Least discounted cost by value iteration.
+    """Return the least discounted cost by value iteration.
+
+    Args:
+        problem: the source.
+        discount: β in (0, 1).
+        grid: grid of the error; the problem's default grid by default.
+        tolerance: largest distance of the bounds, relative to the cost.
 
     Raises:
         ConfigurationError: a discount outside (0, 1).
@@ -192,9 +221,15 @@ def solve_finite(
     initial_deviation: float = 0.0,
     grid: ErrorGrid | None = None,
 ) -> FiniteSolution:
-    """Least expected cost of ``horizon`` steps by dynamic programming.
+    """Return the least expected cost of ``horizon`` steps by dynamic programming.
 
-    x(0) has ``initial_deviation``, the channel's state at time 0 the problem's ``initial`` law.
+    The channel starts in the problem's ``initial`` law.
+
+    Args:
+        problem: the source.
+        horizon: number of steps, >= 1.
+        initial_deviation: standard deviation of x(0).
+        grid: grid of the error; the problem's default grid by default.
 
     Raises:
         ConfigurationError: a value that is not allowed.

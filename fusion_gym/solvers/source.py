@@ -17,8 +17,11 @@ from fusion_gym.validation import ConfigurationError
 
 
 class Resolution(NamedTuple):
-    """What a default grid has: from ``coarsest`` to ``finest`` points a deviation of the noise,
-    between these about so many ``points``; it leaves out a ``negligible`` probability."""
+    """The resolution of a default grid.
+
+    It has from ``coarsest`` to ``finest`` points per standard deviation of the noise, within these
+    limits about ``points`` points, and omits a ``negligible`` probability.
+    """
 
     finest: float
     coarsest: float
@@ -32,15 +35,22 @@ _RESOLUTION_TOKENS = _RESOLUTION._replace(points=300)  # where tokens are limite
 
 @dataclass(frozen=True)
 class SourceProblem:
-    """When should one source transmit, so that w e² + price · transmissions is least?
+    """The transmissions of one source with the least w e² + price · transmissions.
 
-    One step, from the error e and the channel state s of the step before, both known: request or
-    not; the channel moves to s'; a packet is lost with probability ``drop[s']``; the error becomes
-    0 on a delivery and stays e otherwise; its square is paid; then e moves to a e + w.
+    A step starts from the error e and the channel state s of the previous step, both known. The
+    source requests or not, and the channel moves to s'. A packet is lost with probability
+    ``drop[s']``. The error becomes 0 after a delivery and stays e otherwise; the cost contains its
+    square. Then e moves to a e + w.
 
-    ``coefficient`` a, ``deviation`` σ, ``price`` of a transmission, ``error_weight`` w; the
-    channel's ``transition`` (S, S), ``drop`` (S,) and ``initial`` (S,), the law of its state at
-    time 0; ``tokens``, the levels of the bucket.
+    Args:
+        coefficient: a.
+        deviation: standard deviation σ of the noise.
+        price: price of a transmission.
+        error_weight: weight w of the squared error.
+        transition: transition matrix of the channel (S, S).
+        drop: probability of a loss in each channel state (S,).
+        initial: law of the channel's state at time 0 (S,).
+        tokens: levels of the bucket.
     """
 
     coefficient: float
@@ -64,14 +74,7 @@ class SourceProblem:
         bucket: TokenBucket | None = None,
         initial: ArrayLike | None = None,
     ) -> SourceProblem:
-        """Check the numbers; without a bucket transmissions are limited by their price alone.
-
-        Without ``initial`` the channel starts in its stationary law.
-
-        Raises:
-            ConfigurationError: a value that is not allowed, or no ``initial`` for a channel that
-                has no unique stationary law.
-        """
+        """Return the checked problem, by default with unlimited tokens and the stationary law."""
         matrix = validation.array("transition", transition, (None, None))
         if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
             raise validation.refusal("transition", matrix, "a square matrix whose rows sum to 1")
@@ -93,7 +96,7 @@ class SourceProblem:
 
     @property
     def scale(self) -> float:
-        """The threshold that is optimal in continuous time for a = 1: (6 price/w)^¼ σ^½."""
+        """The optimal threshold in continuous time for a = 1: (6 price/w)^¼ σ^½."""
         return float((6.0 * self.price / self.error_weight) ** 0.25 * self.deviation**0.5)
 
     @property
@@ -113,11 +116,17 @@ class SourceProblem:
         wait: float | None = None,
         resolution: Resolution | None = None,
     ) -> ErrorGrid:
-        """A grid of errors up to ``reach`` in steps of ``step``.
+        """Return a grid of errors.
 
-        The default goes beyond what is reached with a probability of 1e-10, in about 600 points
-        (300 with limited tokens), but at most 40 and at least 5 a deviation of the noise.
-        Sources that share the network give their own ``wait`` and ``resolution``.
+        The default grid has about 600 points (300 with limited tokens), and 5 to 40 points per
+        standard deviation of the noise. It covers all errors up to a probability of 1e-10.
+
+        Args:
+            horizon: number of steps; None for no end.
+            reach: largest error.
+            step: distance of the points.
+            wait: steps between two transmissions; the source's ``wait`` by default.
+            resolution: resolution of the default grid.
         """
         if resolution is None:
             resolution = _RESOLUTION if len(self.tokens.level) == 1 else _RESOLUTION_TOKENS
@@ -144,7 +153,7 @@ class SourceProblem:
 
 
 def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
-    """The given law of the channel's state at time 0, or the stationary one."""
+    """Return the given law of the channel's state at time 0, or the stationary law."""
     states = len(transition)
     if values is not None:
         law = validation.not_negative(

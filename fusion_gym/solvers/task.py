@@ -29,12 +29,17 @@ CRITERIA = ("finite", "average")
 class Optimum:
     """The least expected cost, and requests by thresholds or by a table.
 
-    ``cost`` is that of an episode, the negative expected return, with ``criterion="finite"``, and
-    that of a step in the long run with ``"average"``. ``error`` (w e² a step) and ``rate``
-    (transmissions a step) are sums over the sources; they are nan for a table.
-
-    ``threshold`` (T, n, S, K) by step, source, channel state and token level (T = 1 for
-    ``"average"``), or ``choice`` (T, M1, M2, K), the best set of two sources as bits, on ``grids``.
+    Args:
+        cost: cost of an episode, the negative expected return, with ``criterion="finite"``; average
+            cost per step with ``"average"``.
+        error: w e² per step, summed over the sources; nan for a table.
+        rate: transmissions per step, summed over the sources; nan for a table.
+        tokens: levels of the bucket.
+        threshold: thresholds (T, n, S, K) by step, source, channel state and token level; T = 1 for
+            ``"average"``.
+        choice: best set of two sources (T, M1, M2, K), as bits, on ``grids``, instead of
+            thresholds.
+        grids: grids of the errors of two sources.
     """
 
     cost: float
@@ -47,11 +52,13 @@ class Optimum:
 
 
 def source_problems(task: Task) -> tuple[SourceProblem, ...]:
-    """The task's sources, each limited by its price alone.
+    """Return the task's sources, each limited only by its price.
+
+    Args:
+        task: the task.
 
     Raises:
-        ConfigurationError: another system, a price that is drawn, or a reward that does not look
-            at the squared error.
+        ConfigurationError: another system, a drawn price, or a reward without the squared error.
     """
     system, reward = _system(task), task.reward
     if reward.error != "squared":
@@ -83,21 +90,23 @@ def _system(task: Task) -> RemoteEstimationSystem:
 
 
 def solve_task(task: Task, criterion: str = "finite") -> Optimum:
-    """The optimum of one source, of several that share nothing, or of two that share the network.
+    """Return the optimum of one source, of independent sources, or of two that share the network.
 
-    ``criterion="finite"`` is the exact optimum of the task's episodes, ``"average"`` that of an
-    endless one.
+    Args:
+        task: the task.
+        criterion: ``"finite"`` for the exact optimum of the task's episodes, ``"average"`` for an
+            infinite horizon.
 
     Raises:
-        ConfigurationError: a task that is not solved here, for example three sources that share
-            tokens (:func:`fusion_gym.solvers.bounds.lagrangian_bound` bounds its cost from below).
+        ConfigurationError: a task without a solver, for example three sources that share tokens
+            (:func:`fusion_gym.solvers.bounds.lagrangian_bound` bounds its cost from below).
     """
     validation.choice("criterion", criterion, CRITERIA)
     problems, bucket = source_problems(task), task.bucket
     single = len(problems) == 1
     if not single and not (task.access == "any" and bucket.unlimited):
         return _solve_pair(task, problems, criterion)
-    # Of several that share nothing each has tokens without limit, of one level.
+    # Several independent sources have unlimited tokens, of one level.
     tokens = TokenLevels.create(bucket) if single else problems[0].tokens
     costs, errors, rates, result = [], [], [], []
     for i, priced in enumerate(problems):

@@ -1,4 +1,4 @@
-"""The levels that a token bucket can reach, as states of a dynamic programme."""
+"""The reachable levels of a token bucket, as states of a dynamic programme."""
 
 from __future__ import annotations
 
@@ -18,12 +18,16 @@ _DIGITS = 9
 
 @dataclass(frozen=True)
 class TokenLevels:
-    """Every level that can occur, and what each set of requests does to it.
+    """The reachable levels of a token bucket, and the effect of each set of requests.
 
-    A choice is a set of sensors, the bits of its number; choice 0 is silence. ``level`` (K,) in
-    ascending order, ``initial`` the index of the first; ``affordable`` (K, choices) bool, whether
-    the network grants every request of the choice; ``following`` (K, choices), the index of the
-    next level then; ``spent`` (choices,) tokens.
+    A choice is a set of sensors, the bits of its number; choice 0 is silence.
+
+    Args:
+        level: levels (K,) in ascending order.
+        initial: index of the level at the start.
+        affordable: whether the network grants every request of the choice (K, choices), bool.
+        following: index of the next level (K, choices).
+        spent: tokens of each choice (choices,).
     """
 
     level: Array
@@ -34,12 +38,7 @@ class TokenLevels:
 
     @classmethod
     def create(cls, bucket: TokenBucket) -> TokenLevels:
-        """Enumerate the levels; an unlimited bucket has one.
-
-        Raises:
-            ConfigurationError: more than 500 levels: rate, cost and capacity have no large common
-                divisor; or more than 12 sensors, for all sets of them are choices.
-        """
+        """Return the reachable levels of the bucket; an unlimited bucket has one level."""
         sensors = len(bucket.cost)
         if sensors > _MOST_SENSORS:
             raise ConfigurationError(
@@ -79,7 +78,7 @@ class TokenLevels:
         return cls(level, initial, affordable, after.reshape(shape), spent)
 
     def index(self, tokens: Array) -> NDArray[np.int64]:
-        """The index of each level in ``tokens`` (N,)."""
+        """Return the index of each level in ``tokens`` (N,)."""
         if len(self.level) == 1:
             return np.zeros(len(tokens), dtype=np.int64)
         middle = 0.5 * (self.level[1:] + self.level[:-1])

@@ -1,4 +1,4 @@
-"""Whittle's index of a source: the thresholds on its error at many prices."""
+"""Whittle's index of a source, from the thresholds on its error at many prices."""
 
 import pickle
 from dataclasses import replace
@@ -10,19 +10,14 @@ from fusion_gym.solvers.single import solve_average
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
-_PRICES = np.geomspace(0.02, 5000.0, 32)  # in units of w σ², at which the optimum is solved
+_PRICES = np.geomspace(0.02, 5000.0, 32)  # prices of the solved optima, in units of w σ²
 
-# The tables by everything but the price, while the process lives: a sweep asks for one again and
-# again.
+# Cache of the tables by everything but the price, for sweeps.
 _found: dict[bytes, tuple[Array, Array]] = {}
 
 
 def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
-    """Prices (P,) and the thresholds (P, S) there, of source ``number``.
-
-    Raises:
-        ConfigurationError: an unstable source, or thresholds that do not grow with the price.
-    """
+    """Return prices (P,) and the thresholds (P, S) at these prices."""
     key = pickle.dumps(replace(problem, price=0.0))
     if key not in _found:
         _found[key] = _solved(number, problem)

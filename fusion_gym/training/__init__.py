@@ -1,1 +1,1 @@
-"""One training: its config, the algorithms, the model, what watches it."""
+"""Trainings: configs, algorithms, models, monitoring."""

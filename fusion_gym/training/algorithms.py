@@ -1,6 +1,6 @@
-"""Every algorithm is one row of a table: its class, its settings, what it asks for.
+"""The table of algorithms: class, settings and requirements of each.
 
-Settings carry the names that Stable-Baselines3 and sb3-contrib give them.
+Settings have their names in Stable-Baselines3 and sb3-contrib.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from fusion_gym.training.counterfactual import (
 from fusion_gym.training.decisions import Kind
 from fusion_gym.validation import choice
 
-# Share of the steps in which the untrained policy lets every sensor request; by default one half.
-# Where that is far more than the tokens pay for, asking for less changes nothing (another sensor's
-# request is granted instead), and a training can stay there for long.
+# Share of the steps in which the untrained policy requests each sensor; by default one half. Far
+# above the tokens' rate, fewer requests of one sensor only grant another sensor's requests, so the
+# training may stagnate.
 InitialRate = Annotated[float | None, pydantic.Field(gt=0, lt=1)]
 
 
@@ -40,7 +40,7 @@ class NetworkConfig(Strict):
 
 
 class AlgorithmConfig(Strict):
-    """What every algorithm has; ``learning_rate_end`` makes the rate fall linearly to it."""
+    """The settings of every algorithm; the rate falls linearly to ``learning_rate_end``."""
 
     name: str
     learning_rate: Rate = 1e-3
@@ -49,7 +49,7 @@ class AlgorithmConfig(Strict):
     network: NetworkConfig = NetworkConfig()
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the algorithm's class."""
+        """Return the arguments of the algorithm's class."""
         value = self.model_dump(exclude={"name", "learning_rate_end", "network"})
         if self.learning_rate_end is not None:
             value["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
@@ -59,7 +59,7 @@ class AlgorithmConfig(Strict):
 
 
 class A2CConfig(AlgorithmConfig):
-    """A2C, and what PPO has in common with it."""
+    """The settings of A2C, which PPO shares."""
 
     gae_lambda: Share = 0.9
     ent_coef: Weight = 0.0
@@ -69,14 +69,14 @@ class A2CConfig(AlgorithmConfig):
     n_steps: Positive = 8
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the algorithm's class; the initial rate is set on the finished model."""
+        """Return the arguments of the algorithm's class, without the initial rate of the policy."""
         result = super().arguments()
         del result["initial_rate"]
         return result
 
 
 class PPOConfig(A2CConfig):
-    """PPO, also the one that cannot choose what the tokens do not allow (``maskable_ppo``)."""
+    """The settings of PPO and of PPO with masked actions (``maskable_ppo``)."""
 
     n_steps: Positive = 64
     batch_size: Several = 4096
@@ -87,9 +87,9 @@ class PPOConfig(A2CConfig):
 class CounterfactualConfig(PPOConfig):
     """PPO with counterfactual credit (:mod:`.counterfactual`).
 
-    ``alternatives`` of a decision are ``all`` actions, or the requests with one sensor's flipped at
-    a time; by default all where a scheduler has at most 8. Without ``path_credit`` what the view
-    of one step has missed teaches the critic alone.
+    ``alternatives`` of a decision are ``all`` actions, or ``flips``, the requests with one sensor
+    changed at a time. The default is ``all`` for a scheduler with at most 8 sets of requests.
+    Without ``path_credit`` the surplus δ trains only the critic.
     """
 
     learning_rate: Rate = 2e-3
@@ -104,19 +104,19 @@ class CounterfactualConfig(PPOConfig):
 
 
 class RecurrentPPOConfig(PPOConfig):
-    """PPO with a memory, for modes that hide the sensors' signals."""
+    """The settings of PPO with a recurrent policy, for modes that hide the sensors' signals."""
 
     memory: Positive = 64
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the algorithm's class; the memory is the size of its policy's LSTM."""
+        """Return the arguments of the algorithm's class; ``memory`` is the size of the LSTM."""
         result = super().arguments()
         result["policy_kwargs"]["lstm_hidden_size"] = result.pop("memory")
         return result
 
 
 class DQNConfig(AlgorithmConfig):
-    """DQN."""
+    """The settings of DQN."""
 
     buffer_size: Positive = 500_000
     batch_size: Positive = 1024
@@ -131,9 +131,17 @@ class DQNConfig(AlgorithmConfig):
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A row: class, settings, meaning, source, kind of policy, whether Discrete actions only.
+    """A row of the table of algorithms.
 
-    RecurrentPPO accepts MultiBinary actions and then fails on them while it trains.
+    RecurrentPPO accepts MultiBinary actions but fails on them during training.
+
+    Args:
+        model: class of the algorithm.
+        config: class of its settings.
+        meaning: its meaning, in a few words.
+        source: paper or library.
+        policy: kind of policy.
+        discrete_only: whether only Discrete actions are possible.
     """
 
     model: type[BaseAlgorithm]
@@ -145,7 +153,7 @@ class Algorithm:
 
     @property
     def privileged(self) -> bool:
-        """Whether it learns from what no policy may know."""
+        """Whether it learns from information that no policy may use."""
         return issubclass(self.model, Counterfactual)
 
 
@@ -188,11 +196,7 @@ def algorithm_table(_: str) -> str:
 
 
 def settings(content: Any) -> AlgorithmConfig:
-    """The settings of an algorithm, as the class that the table has for its name.
-
-    Raises:
-        ValueError: no settings, an unknown name or setting, or a value that is not allowed.
-    """
+    """Return the settings of an algorithm, in the class that the table has for its name."""
     if isinstance(content, AlgorithmConfig):
         return content
     if not isinstance(content, Mapping):

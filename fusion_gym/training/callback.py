@@ -1,4 +1,4 @@
-"""What the callbacks of a training have in common."""
+"""The base class of the callbacks of a training."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -6,11 +6,11 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 
 
 class Callback(BaseCallback):
-    """A callback between rollouts, which knows the training's environment."""
+    """A callback between rollouts, with access to the training's environment."""
 
     @property
     def environment(self) -> FusionSB3VecEnv:
-        """The environment itself, without wrappers."""
+        """The environment without wrappers."""
         env = self.training_env.unwrapped
         assert isinstance(env, FusionSB3VecEnv)
         return env

@@ -1,4 +1,4 @@
-"""What the suite has, by kind and name, with the declaration of each."""
+"""The catalogue of the library, by kind and name, with a page for each entry."""
 
 import itertools
 import re
@@ -21,14 +21,14 @@ from fusion_gym.training.checked import SHIPPED
 
 
 class Entry(NamedTuple):
-    """One line on what it is, and a function that returns its page in Markdown."""
+    """An entry: its meaning in one line, and a function that returns its page in Markdown."""
 
     meaning: str
     page: Callable[[], str]
 
 
 def catalogue() -> dict[str, dict[str, Entry]]:
-    """Return the entries of every kind by name, with what the user has registered."""
+    """Return the entries of every kind by name, including the user's registrations."""
     return {
         "environments": {
             env_id: Entry(read(options_of(env_id)).summary, partial(_environment, env_id))
@@ -54,12 +54,12 @@ def catalogue() -> dict[str, dict[str, Entry]]:
 
 
 def _declared(owner: Any, meaning: str = "") -> Entry:
-    """Return what a docstring declares."""
+    """Return the entry of a docstring."""
     return Entry(plain_marks(meaning or read(owner).summary), partial(_page, owner, meaning))
 
 
 def _page(owner: Any, meaning: str) -> str:
-    """Return a docstring in Markdown, a heading for each of its labels."""
+    """Return a docstring in Markdown, with a heading for each of its labels."""
     text, labelled = declared = read(owner)
     arguments = "\n".join(f"- `{name}`: {what}" for name, what in declared.arguments.items())
     parts = {"Parameters": arguments, **labelled, "Args": ""}
@@ -75,7 +75,7 @@ def _environment(env_id: str) -> str:
 
 
 def _filters() -> dict[str, Entry]:
-    """Return the filters of all environments; a name may stand for several classes."""
+    """Return the filters of all environments; a name may belong to several classes."""
     owners: dict[str, dict[type, list[str]]] = {}
     for env_id in ENVIRONMENTS:
         for name, owner in options_of(env_id).filters.items():
@@ -87,14 +87,14 @@ def _filters() -> dict[str, Entry]:
 
 
 def _classes(places: Mapping[type, list[str]]) -> str:
-    """Return the declarations of classes, each below the environments that have it."""
+    """Return the declarations of classes, each below the environments of the class."""
     return "\n\n".join(
         f"# {', '.join(where)}\n\n{_declared(owner).page()}" for owner, where in places.items()
     )
 
 
 def _signals() -> dict[str, Entry]:
-    """Return the signals of all environments, each with the environments that have it."""
+    """Return the signals of all environments, each with its environments."""
     rows: dict[str, list[tuple[str, ...]]] = {}
     for env_id in ENVIRONMENTS:
         for signal in make_task(env_id).system.signals:
@@ -124,7 +124,7 @@ def _agent(name: str) -> Entry:
 
 
 def _config(text: str) -> Entry:
-    """Return a config with the sentence of its first comment."""
+    """Return a config with the first sentence of its comment."""
     lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
     comment = " ".join(line.strip("# ") for line in lines)
     return Entry(re.split(r"(?<=[.])\s", comment)[0], partial(textwrap.indent, text, "    "))

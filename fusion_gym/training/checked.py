@@ -1,4 +1,4 @@
-"""Checked YAML: every key is known, and every value is allowed, before anything runs."""
+"""Checked YAML: all keys and values are validated before anything runs."""
 
 import os
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ Share = Annotated[float, pydantic.Field(ge=0, le=1)]
 
 
 class Strict(pydantic.BaseModel):
-    """No unknown keys, no conversions, finite numbers, and nothing changes afterwards."""
+    """A model without unknown keys, conversions, infinite numbers and later changes."""
 
     model_config = pydantic.ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False
@@ -37,7 +37,7 @@ class Strict(pydantic.BaseModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _tuples(cls, content: Any) -> Any:
-        """YAML knows lists alone."""
+        """Convert lists to tuples, because YAML has only lists."""
         if not isinstance(content, Mapping):
             return content
         return {
@@ -47,11 +47,7 @@ class Strict(pydantic.BaseModel):
 
 
 def config_path(name: str | Path, option: str = "config") -> Path:
-    """The file of that path, or the shipped config of that name (``tobit_oscillator_ppo``).
-
-    Raises:
-        ConfigurationError: a bare name that is neither; the message lists the shipped configs.
-    """
+    """Return the file of a path, or the shipped config of a name (``tobit_oscillator_ppo``)."""
     path = Path(name)
     if os.path.isfile(path) or path.suffix or path.name != str(name):
         return path
@@ -60,42 +56,23 @@ def config_path(name: str | Path, option: str = "config") -> Path:
 
 
 def load_checked(kind: type[Model], name: str | Path, option: str = "config") -> Model:
-    """The config of a path or shipped name, checked; ``option`` is where the user named it.
-
-    Raises:
-        ConfigurationError: unreadable, an unknown key, or a value that is not allowed; names the
-            file and the first such field.
-    """
+    """Return the checked config of a path or shipped name."""
     return parse(kind, read_yaml(name, option), str(name), option)
 
 
 def read_yaml(name: str | Path, option: str = "config") -> Any:
-    """What the config of a path or shipped name holds.
-
-    Raises:
-        ConfigurationError: no such file, or no YAML.
-    """
+    """Return the content of the config of a path or shipped name."""
     text = validation.read_text(option, config_path(name, option), str(name))
     return parsed(text, f"{option} {str(name)!r}")
 
 
 def parse(kind: type[Model], content: Any, source: str, option: str = "config") -> Model:
-    """The content as a checked model.
-
-    Raises:
-        ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and
-            the first such field.
-    """
+    """Return the content as a checked model; an error names ``source`` and the first field."""
     return checked(kind, content, f"{option} {source!r}")
 
 
 def checked(shape: type[Shape], content: Any, source: str) -> Shape:
-    """The content as what ``shape`` says.
-
-    Raises:
-        ConfigurationError: an unknown key, or a value that is not allowed; names ``source`` and the
-            first such field.
-    """
+    """Return the content as an object of a type; an error names the first wrong field."""
     try:
         return pydantic.TypeAdapter(shape).validate_python(content)
     except pydantic.ValidationError as error:

@@ -1,11 +1,10 @@
-"""The checkpoint: one file from which a training goes on as if it had not been interrupted.
+"""The checkpoint: one file from which a training continues as if it had not been interrupted.
 
-It is the archive that Stable-Baselines3 writes, and in it also what that leaves out: the states of
-all random generators, the episodes under way, a recurrent policy's memory, the replay buffer, the
-best model so far and the journal. Being one file, it is replaced in one move.
+It is the archive of Stable-Baselines3 with further parts: the states of all random generators, the
+running episodes, the memory of a recurrent policy, the replay buffer, the best model so far and the
+journal. One file can be replaced atomically.
 
-Stable-Baselines3's loader and the states are pickles: a checkpoint is for going on with one's own
-training, and is not to be taken from others.
+The states and the archive's entries are pickles. Load only checkpoints of your own trainings.
 """
 
 import json
@@ -24,19 +23,22 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.output.files import DAMAGED, replacing
 from fusion_gym.validation import ConfigurationError
 
-# Entries of the archive beside those of Stable-Baselines3.
+# Additional entries of the archive.
 _JOURNAL, _STATE, _BEST = "journal.json", "state.pkl", "best_model.zip"
-# What Stable-Baselines3 leaves out of its archive: DQN's memory, and that of a recurrent policy.
+# Attributes that Stable-Baselines3 does not save: replay buffer and recurrent memory.
 _LEFT_OUT = ("replay_buffer", "_last_lstm_states")
 
 
 @dataclass
 class Journal:
-    """What a training has done so far.
+    """The progress of a training.
 
-    ``inputs`` is what it was made from, ``records`` are its validations, ``seconds`` the wall time
-    by activity and ``cpu_seconds`` the processor's, validation apart, over all stretches; ``best``
-    is the best model's file.
+    Args:
+        inputs: inputs of the training.
+        records: its validations.
+        seconds: wall time by activity, over all parts of the training.
+        cpu_seconds: processor time without validation, over all parts of the training.
+        best: file of the best model.
     """
 
     inputs: dict[str, Any]
@@ -53,7 +55,7 @@ class Journal:
 def save_checkpoint(
     path: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, journal: Journal
 ) -> None:
-    """Write the checkpoint; between rollouts, for a rollout under way is no part of it."""
+    """Write the checkpoint between two rollouts; it does not include a rollout in progress."""
     content = asdict(journal)
     best = content.pop("best")
     with replacing(path) as partial:
@@ -67,13 +69,7 @@ def save_checkpoint(
 
 
 def read_journal(path: Path) -> Journal:
-    """The journal of a checkpoint; every entry of the file is checked against its sum.
-
-    Nothing is unpickled.
-
-    Raises:
-        ConfigurationError: the file is damaged, or no checkpoint.
-    """
+    """Return the journal of a checkpoint after a check of all checksums, without unpickling."""
     try:
         with zipfile.ZipFile(path) as archive:
             broken = archive.testzip()
@@ -90,14 +86,14 @@ def read_journal(path: Path) -> Journal:
 
 
 def restore(path: Path, kind: type[BaseAlgorithm], env: FusionSB3VecEnv) -> BaseAlgorithm:
-    """The model of a checkpoint; environment and random generators are put back in their states."""
+    """Return the model of a checkpoint, and restore the environment and all random generators."""
     model = kind.load(path, env=env, device="cpu", force_reset=False)
     with zipfile.ZipFile(path) as archive, archive.open(_STATE) as file:
         state = pickle.load(file)
     env.restore(state["env"])
     for name, value in state["model"].items():
         setattr(model, name, value)
-    # Last, for loading a model seeds them anew.
+    # Last, because loading a model seeds them.
     random.setstate(state["python"])
     np.random.set_state(state["numpy"])  # noqa: NPY002
     torch.set_rng_state(state["torch"])
@@ -106,7 +102,7 @@ def restore(path: Path, kind: type[BaseAlgorithm], env: FusionSB3VecEnv) -> Base
 
 
 def _state(model: BaseAlgorithm, env: FusionSB3VecEnv) -> dict[str, Any]:
-    """What Stable-Baselines3 does not save, though a training depends on it."""
+    """Return the state of a training that Stable-Baselines3 does not save."""
     return {
         "env": env.snapshot(),
         "model": {name: vars(model)[name] for name in _LEFT_OUT if name in vars(model)},

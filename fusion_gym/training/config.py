@@ -1,4 +1,4 @@
-"""A training as typed YAML."""
+"""The config of a training as typed YAML."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from fusion_gym.training.checked import Positive, Share, Strict, parse
 
 
 class EnvironmentConfig(Strict):
-    """A registered environment and the options of ``gym.make`` that differ from its defaults.
+    """A registered environment and its options of ``gym.make``.
 
-    ``local`` trains one policy that every sensor runs by itself, on what it sees by itself. A file
-    of options that ``options`` name as ``system`` is read here: what it says belongs to the config.
+    ``local`` trains one policy that every sensor runs on its local view. If the option ``system``
+    names a file of options, the config includes its content.
     """
 
     id: str
@@ -31,17 +31,17 @@ class EnvironmentConfig(Strict):
 
 
 class TrainingConfig(Strict):
-    """How long, with how many runs side by side, from which seed, on how many threads.
+    """Length, number of runs, seed and threads of a training.
 
-    ``price_exponent`` is for a price that is drawn: episodes count by (middle of the range /
-    price)^exponent, in training and in validation, so that an agent does not neglect low prices.
-    With more sensors than ``many_sensors``, ``timesteps`` fall in proportion, for a step of theirs
-    takes longer.
+    If the price is drawn, an episode has the weight (middle of the range /
+    price)^``price_exponent`` in training and validation. A positive exponent raises the weight of
+    low prices. With more sensors than ``many_sensors``, ``timesteps`` falls in proportion, because
+    a step takes longer.
 
-    ``error`` is what is trained on (validations are of the true error): ``excess`` and ``mismatch``
-    take off what no policy can change, by an estimate that takes in every measurement with the
-    filter ``error_filter``, by default that of a memory. The mismatch has the least noise, and is
-    right where that estimate is the conditional mean.
+    ``error`` is the trained error; validations use the true error. ``excess`` and ``mismatch``
+    subtract the part that no policy can change, by an estimate from every measurement.
+    ``error_filter`` is the filter of this estimate, by default the memory's filter. The mismatch
+    has the least noise, and is correct if this estimate is the conditional mean.
     """
 
     timesteps: Positive
@@ -55,7 +55,7 @@ class TrainingConfig(Strict):
 
 
 class ValidationConfig(Strict):
-    """Evaluation during training, on seeds that neither training nor a test uses."""
+    """Evaluation during training, on seeds that neither training nor tests use."""
 
     every: Positive = 500_000
     episodes: Positive = 256
@@ -63,7 +63,7 @@ class ValidationConfig(Strict):
 
 
 class Experiment(Strict):
-    """One training: environment, algorithm, length, validation, and where results go."""
+    """One training: environment, algorithm, length, validation and output folder."""
 
     environment: EnvironmentConfig
     algorithm: AnyAlgorithm
@@ -72,16 +72,13 @@ class Experiment(Strict):
     output: str = pydantic.Field(min_length=1, pattern=r"^[^\n\t]+$")
 
     def inputs(self) -> dict[str, Any]:
-        """What the results depend on; a training can be made longer, moved, or given threads."""
+        """Return the inputs that determine the results, without length, folder and threads."""
         return self.model_dump(
             mode="json", exclude={"output": True, "training": {"timesteps": True, "threads": True}}
         )
 
     def resolved(self, settings: Mapping[str, Any], sensors: int) -> Experiment:
-        """Return the experiment with the numbers that ``"auto"`` and ``many_sensors`` stand for.
-
-        ``settings`` belong to the environment's task, which has so many ``sensors``.
-        """
+        """Return the experiment with numbers in the place of ``"auto"`` and ``many_sensors``."""
         options, training = self.environment.options, self.training
         numbers = {
             name: settings[name]
@@ -98,11 +95,7 @@ class Experiment(Strict):
     def changed(
         self, output: str | Path | None, options: Mapping[str, Any] | None = None, **training: Any
     ) -> Experiment:
-        """The experiment with another output, options, training where given, checked again.
-
-        Raises:
-            ConfigurationError: a value that is not allowed.
-        """
+        """Return the experiment with other output, options and training, checked again."""
         plain = self.model_dump() | ({} if output is None else {"output": str(output)})
         environment = plain["environment"]
         environment["options"] |= open_options(environment["id"], options or {})

@@ -1,8 +1,8 @@
-"""PPO with counterfactual credit: the simulator steps what might have been done instead.
+"""PPO with counterfactual credit: the simulator steps the alternatives of each decision.
 
-The advantage of a request is read off from the alternatives of the decision, stepped on the same
-noise, instead of from the return that followed, in which it drowns. Only the training knows them:
-the policy sees what it will see in use, and what is saved is an ordinary model of PPO.
+The advantage of a request is the difference to the alternatives of the decision, which are stepped
+on the same noise. It has less noise than the return. Only the training uses the alternatives: the
+policy has its usual observation, and the saved model is an ordinary PPO model.
 """
 
 from __future__ import annotations
@@ -25,15 +25,23 @@ from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.training.decisions import Chosen, Decisions, Kind
 from fusion_gym.validation import ConfigurationError
 
-_CLOSED = -1e8  # the logit of a choice that is masked
+_CLOSED = -1e8  # the logit of a masked choice
 
 
 class RolloutBatch(NamedTuple):
-    """What one stretch of T steps taught, B = T · runs.
+    """The data of one rollout of T steps, with B = T · runs.
 
-    ``observations`` (B, entries), ``masks`` (B, choices) or ``None``, and where sensors decide by
-    themselves (B, sensors, …), ``choices`` (B, D), ``old`` log-probabilities and ``advantages``
-    (B, D, C), ``surplus`` δ, ``returns`` G and ``values`` (B,).
+    D is the number of factors of a decision and C the number of choices of a factor.
+
+    Args:
+        observations: (B, entries), or with local decisions (B, sensors, entries).
+        masks: (B, choices), or with local decisions (B, sensors, choices); None without masks.
+        choices: the choices (B, D).
+        old: log-probabilities before the update (B, D, C).
+        advantages: A (B, D, C).
+        surplus: δ (B,).
+        returns: G (B,).
+        values: V (B,).
     """
 
     observations: torch.Tensor
@@ -47,21 +55,31 @@ class RolloutBatch(NamedTuple):
 
 
 class Counterfactual(OnPolicyAlgorithm):
-    """What PPO and MaskablePPO have in common here; it stands before the one that it changes.
+    """A mixin with counterfactual credit for PPO and MaskablePPO; it precedes them as a base class.
 
-    Source of the surrogate, its clipping and the λ-returns: Schulman et al. 2015, 2017. For the
-    action b taken and each alternative a of a decision, on the same noise, Q_a = r_a + γ V(o'_a),
-    V̄ = Σ π_a Q_a, A_a = Q_a - V̄; one factor at a time, V̄ is their mean. Along the path
-    G = V̄ + δ, δ = γ λ (G' - V(o'_b)), zero at the end of an episode and of the rollout: G is the
-    critic's target, δ what the view of one step has missed. Both are divided by the spread
-    √(mean Σ π_a A_a²).
+    The surrogate, its clipping and the λ-returns are from Schulman et al. 2015, 2017. For the
+    action b taken and each alternative a of a decision, on the same noise,
 
-    Where sensors decide by themselves, V of a run is the sum of what the critic says of their
-    rows (value decomposition: Sunehag et al. 2018), so that nobody has to guess what the others
-    see, and δ is weighed with each sensor's own ratio.
+        Q_a = r_a + γ V(o'_a),  V̄ = Σ π_a Q_a,  A_a = Q_a - V̄,
 
-    Without ``path_credit`` δ teaches the critic alone: it holds the noise of all that a run's
-    reward is of, which with many sensors is far more than one decision can move.
+    with one factor of the decision at a time and the mean of V̄ over the factors. Along the path
+
+        G = V̄ + δ,  δ = γ λ (G' - V(o'_b)),
+
+    and δ = 0 at the end of an episode and of the rollout. G is the critic's target. Advantages and
+    δ are divided by the spread √(mean Σ π_a A_a²).
+
+    With local decisions V of a run is the sum of the critic's values of its rows (value
+    decomposition: Sunehag et al. 2018), and δ has each sensor's own ratio.
+
+    Without ``path_credit`` δ trains only the critic. δ contains the noise of the whole reward of a
+    run, which with many sensors exceeds the effect of one decision.
+
+    Args:
+        *args: arguments of the algorithm.
+        alternatives: kind of alternatives.
+        path_credit: whether δ trains the policy.
+        **kwargs: arguments of the algorithm.
     """
 
     n_epochs: int
@@ -132,7 +150,7 @@ class Counterfactual(OnPolicyAlgorithm):
         return True
 
     def _credited(self, steps: list[_Step]) -> RolloutBatch:
-        """Advantages and returns of a rollout, undivided."""
+        """Return the batch of a rollout, before the division by the spread."""
         values = [self._value(step.observation.numpy()) for step in steps]
         advantages, surplus, returns = [], [], []
         ahead = np.zeros(len(steps[0].dones))
@@ -200,10 +218,14 @@ class Counterfactual(OnPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _rescale_critic(self, size: float) -> None:
-        """Let the critic's unit follow the root mean square of the returns, its values unchanged.
+        """Adapt the critic's scale to the returns' root mean square, with unchanged values.
 
-        Source: van Hasselt et al. 2016 (Pop-Art). In the returns' own unit a large loss of the
-        critic takes all of the gradient that clipping leaves.
+        Otherwise a large loss of the critic would dominate the clipped gradient.
+
+        Source: van Hasselt et al. 2016 (Pop-Art).
+
+        Args:
+            size: root mean square of the returns.
         """
         policy: Any = self.policy
         scale = self.value_scale * (size / self.value_scale) ** (0.05 if self._n_updates else 1.0)
@@ -246,7 +268,7 @@ class Counterfactual(OnPolicyAlgorithm):
         return loss, parts
 
     def _logits(self, observation: torch.Tensor, masks: torch.Tensor | None) -> torch.Tensor:
-        """Of the choices of ``Discrete``, of the requests of ``MultiBinary``."""
+        """Return the logits of ``Discrete`` choices or of ``MultiBinary`` requests."""
         policy: Any = self.policy
         rows = policy.pi_features_extractor(observation.reshape(-1, observation.shape[-1]))
         logits: torch.Tensor = policy.action_net(policy.mlp_extractor.forward_actor(rows))
@@ -264,39 +286,38 @@ class Counterfactual(OnPolicyAlgorithm):
         return values.sum(-1) if self._decisions.local else values
 
     def _value(self, observation: NDArray[np.float32]) -> Array:
-        """V of runs whose decisions are made on observations (…, entries) or, where sensors decide
-        by themselves, (…, sensors, entries)."""
+        """Return V of runs, from observations (…, entries) or local ones (…, sensors, entries)."""
         with torch.no_grad():
             return self._critic(torch.as_tensor(observation)).numpy().astype(np.float64)
 
     def _beyond(self, observation: NDArray[np.float32]) -> Array:
-        """V of what the alternatives led to, (A, runs), from observations (A, runs, entries)."""
+        """Return V (A, runs) after the alternatives, from observations (A, runs, entries)."""
         if not self._decisions.local:
             return self._value(observation)
-        # One by one: that many rows of that many sensors would not fit into the cache.
+        # One by one, because the rows of all alternatives would not fit into the cache.
         return np.stack([self._value(self._decisions.visible_rows(item)) for item in observation])
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
-        """Open choices of the runs' decisions, for an algorithm that knows them."""
+        """Return the masks of the runs' decisions, for an algorithm with masks."""
         return None
 
 
 class CounterfactualPPO(Counterfactual, PPO):
-    """PPO with counterfactual credit; what it saves are models of PPO."""
+    """PPO with counterfactual credit, which saves models of PPO."""
 
 
 class CounterfactualMaskablePPO(Counterfactual, MaskablePPO):
-    """MaskablePPO with counterfactual credit; what it saves are models of MaskablePPO."""
+    """MaskablePPO with counterfactual credit, which saves models of MaskablePPO."""
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
         return self._decisions.by_run(torch.as_tensor(env.action_masks()))
 
 
 class _Step(NamedTuple):
-    """One step of all runs, on the way to a :class:`RolloutBatch`.
+    """One step of all runs, before it becomes part of a :class:`RolloutBatch`.
 
-    ``values`` (runs, D, C) are the values Q of all choices, ``follows`` (runs,) that of the state
-    reached; ``dones`` (runs,) bool.
+    ``values`` (runs, D, C) are the values Q of all choices, ``follows`` (runs,) the values of the
+    next states, ``dones`` (runs,) bool.
     """
 
     observation: torch.Tensor
@@ -309,7 +330,7 @@ class _Step(NamedTuple):
 
 
 def _terminated(dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> NDArray[np.bool_]:
-    """The rows whose episode has ended for good, after which nothing has a value."""
+    """Return the rows whose episode has terminated without truncation, so no value follows."""
     result = dones.copy()
     for row in np.flatnonzero(dones):
         result[row] = not infos[row]["TimeLimit.truncated"]
@@ -317,11 +338,7 @@ def _terminated(dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> NDArra
 
 
 def _privileged(env: Any) -> PrivilegedVecEnv:
-    """The training's own environment.
-
-    Raises:
-        ConfigurationError: another one, which cannot step alternatives.
-    """
+    """Return the training's environment without wrappers, or refuse one without alternatives."""
     result = env.unwrapped
     if not isinstance(result, PrivilegedVecEnv):
         raise ConfigurationError(

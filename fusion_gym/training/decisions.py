@@ -1,4 +1,4 @@
-"""What could have been decided instead, as a learner needs it: probabilities, requests, values."""
+"""The alternatives of a decision for a learner: probabilities, requests and values."""
 
 from typing import Any, Literal
 
@@ -13,8 +13,8 @@ from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError
 
 Kind = Literal["all", "flips"]
-MOST_ALTERNATIVES = 8  # sets of requests that are all stepped unless told otherwise
-MOST_SENSORS = 10  # whose sets of requests are all stepped where that is asked for
+MOST_ALTERNATIVES = 8  # largest number of sets of requests for the default "all"
+MOST_SENSORS = 10  # largest number of sensors for "all"
 Chosen = NDArray[np.int64]  # choices (runs, D)
 
 
@@ -22,8 +22,12 @@ class Decisions:
     """The alternatives of every run's decision, as D factors of C choices each.
 
     - ``"all"``: one factor, whose choices are all actions of a scheduler.
-    - ``"flips"``: a factor a sensor, silence or a request, the other sensors as they were; so too
-      where the sensors decide by themselves.
+    - ``"flips"``: one factor per sensor, silence or a request, with the other sensors unchanged;
+      also for local decisions.
+
+    Args:
+        env: the environment.
+        kind: kind of alternatives; None for the default.
 
     Raises:
         ConfigurationError: flips of an action that is one number, or all sets of more than 10
@@ -58,11 +62,7 @@ class Decisions:
             self.requests = env.view.requests(actions, self.choices).T[:, :, None]
 
     def _check_choices(self) -> None:
-        """Refuse more than can be stepped: of one sensor at a time there are no more than sensors.
-
-        Raises:
-            ConfigurationError: all sets of more than 10 sensors.
-        """
+        """Refuse more sets of requests than 2^10."""
         if self.choices <= 2**MOST_SENSORS:
             return
         text, instead = ("action = 'discrete'", "action must be 'binary'")
@@ -74,10 +74,11 @@ class Decisions:
         )
 
     def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:
-        """Of all choices, (runs, D, C).
+        """Return the log-probabilities of all choices (runs, D, C).
 
-        From the logits of ``Discrete``, (runs, choices) or of sensors by themselves
-        (runs, sensors, 2), or of the requests of ``MultiBinary`` (runs, sensors).
+        Args:
+            logits: for ``Discrete`` (runs, choices), for local decisions (runs, sensors, 2), for
+                the requests of ``MultiBinary`` (runs, sensors).
         """
         if not self.binary:
             values = torch.log_softmax(logits, -1)
@@ -88,19 +89,15 @@ class Decisions:
         return (silent.sum(-1, keepdim=True) + logits @ self.bits.T)[:, None]
 
     def by_run(self, rows: Any) -> Any:
-        """Rows (rows, entries) that belong to a run together, (runs, sensors, entries).
-
-        A scheduler's rows are runs already.
-        """
+        """Return local rows (rows, entries) by run (runs, sensors, entries); others unchanged."""
         return rows.reshape(-1, self.sensors, rows.shape[-1]) if self.local else rows
 
     def visible_rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What the sensors of runs see by themselves, (runs, sensors, entries of a row), from
-        observations (runs, entries)."""
+        """Return the local views (runs, sensors, entries) of observations (runs, entries)."""
         return self.by_run(self.view.rows(observation))
 
     def actions(self, choice: Chosen) -> NDArray[Any]:
-        """The rows' actions of the space from the choices (runs, D)."""
+        """Return the actions of the rows from the choices (runs, D)."""
         if not self.binary:
             return choice.reshape(-1)
         if self.kind == "flips":
@@ -108,14 +105,14 @@ class Decisions:
         return choice >> np.arange(self.sensors) & 1
 
     def alternatives(self, choice: Chosen) -> NDArray[Any]:
-        """The requests (A, sensors, N) that are stepped beside those chosen (runs, D)."""
+        """Return the alternative requests (A, sensors, N) of the choices (runs, D)."""
         if self.kind == "all":
             return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
         taken = choice.T == 1
         return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
 
     def arranged(self, choice: Chosen, taken: Array, stepped: Array) -> Array:
-        """Values (runs, D, C) of all choices, from those taken (runs,) and stepped (A, runs)."""
+        """Return the values (runs, D, C) of all choices, from taken and stepped (A, runs) ones."""
         if self.kind == "all":
             return stepped.T[:, None]
         flipped = stepped.T

@@ -1,7 +1,6 @@
-"""What a training shows beside its loss: traffic, entropy, and the validation at each price.
+"""Diagnostics of a training besides its loss: traffic, entropy and validation at each price.
 
-``docs/learning.md`` says what each line looks like in a healthy training, and what is wrong where
-it does not.
+``docs/learning.md`` describes each line in a healthy training and the causes of deviations.
 """
 
 import warnings
@@ -16,14 +15,14 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.training.callback import Callback
 
-PARTS = 5  # of the range of prices, equal in the logarithm
+PARTS = 5  # of the range of prices, equal on a logarithmic scale
 
 
 class Traffic(Callback):
-    """Logs the rates of a rollout, requested and granted, and the policy's entropy a sensor.
+    """Logs the rates of requests and grants in a rollout, and the policy's entropy per sensor.
 
-    Rates are per sensor and step. The entropy, in nats, is that of the update before the rollout,
-    for algorithms that report one.
+    Rates are per sensor and step. The entropy, in nats, is from the update before the rollout, for
+    algorithms that report it.
     """
 
     def _on_rollout_start(self) -> None:
@@ -44,7 +43,7 @@ class Traffic(Callback):
 
 
 def prices_of(task: Task, episodes: int, seed: int) -> Array:
-    """The prices (E,) of a token in the episodes with these seeds."""
+    """Return the prices (E,) of a token in the episodes of these seeds."""
     fixed = task.reward.price.fixed
     if fixed is not None:
         return np.full(episodes, fixed)
@@ -52,11 +51,7 @@ def prices_of(task: Task, episodes: int, seed: int) -> Array:
 
 
 def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[str, Any]]:
-    """Rate and MSE of the episodes in each part of the range of prices that has some.
-
-    None where the price is fixed. Each part has the ``low`` and ``high`` end of its prices, its
-    number of ``episodes``, their ``rate`` per sensor and step, and their ``mse``.
-    """
+    """Return rate and MSE of the episodes in each non-empty part of the range of prices."""
     span = task.reward.price.span
     if task.reward.price.fixed is not None or span is None:
         return []
@@ -76,11 +71,7 @@ def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[st
 
 
 def warn_of_unused_tokens(task: Task, results: EpisodeResults) -> None:
-    """Warn of an agent that spends less than half of its tokens at its lowest price.
-
-    Warns:
-        UserWarning: it does; names its share of what the bucket sustains.
-    """
+    """Warn if an agent spends less than half of its tokens at its lowest price."""
     sustained = sustained_tokens(task)
     share = float(results.tokens.mean()) / sustained if sustained else 1.0
     if share < 0.5 and not task.bucket.unlimited:

@@ -1,4 +1,4 @@
-"""The environment that a command is about, from ``--env``, ``--set`` and ``--config``."""
+"""The environment of a command, from ``--env``, ``--set`` and ``--config``."""
 
 from __future__ import annotations
 
@@ -15,17 +15,13 @@ if TYPE_CHECKING:
 def environment_of(
     env: str | None, config: str | None, settings: tuple[tuple[str, ...], ...]
 ) -> tuple[str, dict[str, Any], Experiment | None]:
-    """Id, options and training: what ``settings`` say goes before the training's own options.
-
-    Raises:
-        ConfigurationError: neither an id nor a config, or a config that is not allowed.
-    """
+    """Return id, options and training of a command line; ``settings`` override the config."""
     options = parse_settings("option", list(chain(*settings)))
     if config is None:
         if env is None:
             raise ConfigurationError("env = None is not allowed: give --env ID or --config FILE")
         return env, options, None
-    # Here, for it needs Stable-Baselines3, which takes seconds to load.
+    # Imported here, because Stable-Baselines3 takes seconds to load.
     from fusion_gym.training.checked import load_checked
     from fusion_gym.training.config import Experiment
 

@@ -1,4 +1,4 @@
-"""New models of a config's algorithm, and with which policy they begin."""
+"""Create models of a config's algorithm, with their initial policy."""
 
 from typing import Any
 
@@ -21,18 +21,14 @@ from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.config import EnvironmentConfig, Experiment
 from fusion_gym.validation import ConfigurationError, refusal
 
-# Of the warning of a cross term:
+# Constants of the warning of a cross term:
 _EPISODES = 150  # of each of two policies: a second or two in the slowest environment
 _SEED = 700_000_000  # far from the seeds of trainings, validations, tuning and tests
-_LEVEL = 0.99  # of the intervals together: one of a hundred settings is warned of for nothing
+_LEVEL = 0.99  # of the intervals together: one false warning in a hundred settings
 
 
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
-    """The environment to train in.
-
-    Raises:
-        ConfigurationError: actions that the algorithm does not know.
-    """
+    """Return the training environment."""
     name, local = experiment.algorithm.name, experiment.environment.local
     many = not local and task.action != "discrete" and task.access != "single"
     if TABLE[name].discrete_only and many:
@@ -58,11 +54,7 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
 
 
 def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -> System[Any]:
-    """What takes in every measurement: the task's own memory where that has the same filter.
-
-    Raises:
-        ConfigurationError: the environment has no such filter.
-    """
+    """Return the system that processes every measurement, if possible the task's memory."""
     if task.memory_system is not None and error_filter in (
         None,
         where.options.get("memory_filter"),
@@ -79,19 +71,14 @@ def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
-    """A new model of the config's algorithm.
-
-    Raises:
-        ConfigurationError: settings that the algorithm's class refuses, or an ``initial_rate``
-            that the action space does not allow.
-    """
+    """Return a new model of the config's algorithm."""
     settings = experiment.algorithm
     row = TABLE[settings.name]
     try:
         model = row.model(
             row.policy, env, seed=experiment.training.seed, device="cpu", **settings.arguments()
         )
-    except (AssertionError, ValueError) as error:  # what Stable-Baselines3 checks by itself
+    except (AssertionError, ValueError) as error:  # checks of Stable-Baselines3
         reason = " ".join(str(error).split())
         raise ConfigurationError(
             f"algorithm = {settings.name!r} is not allowed with these settings: {reason}"
@@ -104,12 +91,14 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
 
 
 def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
-    """Logits of the choices with which every sensor requests in a share ``rate`` of the steps.
+    """Return logits of the choices with which every sensor requests at ``rate``.
 
-    Shape (sensors,) for ``MultiBinary``, else one a number of ``Discrete``.
+    Args:
+        env: the training environment.
+        rate: share of the steps with a request of a sensor.
 
-    Raises:
-        ConfigurationError: one sensor a step, and the sensors' rates exceed 1 together.
+    Returns:
+        Logits (sensors,) for ``MultiBinary``, or one per number of ``Discrete``.
     """
     odds, space, sensors = np.log(rate / (1.0 - rate)), env.action_space, env.task.sensors
     if isinstance(space, MultiBinary):
@@ -140,13 +129,9 @@ def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
 
 
 def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
-    """Print the cross term, with its interval, if that says that it is not zero.
-
-    Two policies are measured: random requests at the rate at which the training begins, and
-    the one of the greatest value that the environment knows.
-    """
+    """Print the largest cross term of two usual policies if its interval excludes zero."""
     task, reference = env.task, env.batch.reference
-    assert reference is not None  # the environment of such a training has one
+    assert reference is not None  # present in the environment of such a training
     begins = getattr(experiment.algorithm, "initial_rate", None)
     rate = begins or 0.5
     policies = {name: make_policy(name, task) for name in usual_policies(task, rate)}

@@ -1,4 +1,4 @@
-"""What watches a training: interrupts, validation, checkpoints, the split of the wall time."""
+"""The control of a training: interrupts, validation, checkpoints and wall time."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from fusion_gym.training.diagnosis import by_price, prices_of
 
 
 class Interrupt:
-    """Turns Ctrl-C and SIGTERM into a flag while it is entered; a second Ctrl-C gets through.
+    """Turns Ctrl-C and SIGTERM into a flag inside the context; a second Ctrl-C interrupts.
 
-    In a thread, as a cluster's workers have, signals belong to somebody else: nothing happens.
+    Outside the main thread, as in the workers of a cluster, signals are not handled.
     """
 
     def __init__(self) -> None:
@@ -55,11 +55,11 @@ class Interrupt:
 
 
 class Stop(Exception):
-    """Ends a training between two rollouts, where the steps counted are the steps trained on."""
+    """Ends a training between two rollouts, where the model has learned from all counted steps."""
 
 
 class Progress(Callback):
-    """Validation, best model, checkpoints, the progress bar and the split of the wall time."""
+    """Validates, saves the best model and checkpoints, and shows progress and wall time."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Progress(Callback):
         self._mark = _now()
         self._env_mark = 0.0
         self._next = 0
-        self._due = False  # a checkpoint, as soon as the model has learned from the rollout
+        self._due = False  # whether a checkpoint follows the next update
         self._write_records()
         if journal.best is not None:
             self._write_best(journal.best)
@@ -104,7 +104,7 @@ class Progress(Callback):
         self.journal.seconds["policy"] -= environment
         self.journal.seconds["environment"] += environment
         self.bar.reach(self.num_timesteps)
-        # The last validation is that of the finished model.
+        # The finished model has the last validation.
         if self._next <= self.num_timesteps < self.experiment.training.timesteps:
             self._plan()
             self._due = True
@@ -115,7 +115,7 @@ class Progress(Callback):
         self._measure("update")
 
     def _measure(self, activity: str) -> None:
-        """Add the time since the last call to an activity's."""
+        """Add the time since the last call to an activity."""
         now = _now()
         self.journal.seconds[activity] += now[0] - self._mark[0]
         if activity != "validation":
@@ -123,12 +123,12 @@ class Progress(Callback):
         self._mark = now
 
     def _plan(self) -> None:
-        """The next validation is at the next multiple of the steps between two."""
+        """Set the next validation to the next multiple of the steps between two validations."""
         every = self.experiment.validation.every
         self._next = (self.num_timesteps // every + 1) * every
 
     def finish(self) -> None:
-        """Validate the finished model, if that was not done before."""
+        """Validate the finished model, unless its last validation did."""
         records = self.journal.records
         if not records or records[-1]["timesteps"] < self.num_timesteps:
             self._mark = _now()
@@ -136,7 +136,7 @@ class Progress(Callback):
             self._measure("validation")
 
     def validate(self) -> None:
-        """Run the validation episodes, log them, and keep the model if it is the best so far."""
+        """Run the validation episodes, log them, and save the model if it is the best so far."""
         results = self._run()
         record: dict[str, Any] = {
             "timesteps": self.num_timesteps,
@@ -185,12 +185,12 @@ class Progress(Callback):
 
     @functools.cached_property
     def prices(self) -> Array:
-        """Of a token in each validation episode."""
+        """The price of a token in each validation episode."""
         settings = self.experiment.validation
         return prices_of(self.task, settings.episodes, settings.seed)
 
     def _weights(self) -> Array:
-        """What each validation episode's return counts, by its price."""
+        """Return the weight of each validation episode's return, by its price."""
         exponent = self.experiment.training.price_exponent
         if exponent == 0.0:
             return np.ones(1)
@@ -204,10 +204,10 @@ class Progress(Callback):
 
 
 def log_line(record: dict[str, Any]) -> str:
-    """A validation in a few words."""
+    """Return a validation in a few words."""
     return f"MSE {record['mse']:.4f}, rate {record['rate']:.3f}"
 
 
 def _now() -> tuple[float, float]:
-    """Seconds of the wall, and of this process on all its processors."""
+    """Return seconds of wall time, and of this process on all processors."""
     return time.perf_counter(), time.process_time()

@@ -1,4 +1,4 @@
-"""One training from config to summary; it can be ended at any moment and gone on with."""
+"""One training from config to summary, which can be interrupted and resumed."""
 
 import time
 from pathlib import Path
@@ -30,17 +30,12 @@ TRAINING_SEEDS = 1_000_000_000
 
 
 def holds_training(folder: Path) -> bool:
-    """Whether a training was begun in the folder."""
+    """Return whether the folder contains a training."""
     return any((folder / name).exists() for name in ("config.yaml", "latest.zip"))
 
 
 def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | None:
-    """The journal of the training to go on with; none where it is begun.
-
-    Raises:
-        ConfigurationError: the folder holds a training and ``resume`` is false, there is nothing
-            to resume, the training there had another config, or its checkpoint is damaged.
-    """
+    """Return the journal of the training to resume, or None for a new training."""
     where, checkpoint = f"the training in {str(folder)!r}", folder / "latest.zip"
     if not resume:
         if holds_training(folder):
@@ -58,18 +53,14 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
             f"output = {str(folder)!r} holds a finished training without its checkpoint, "
             "latest.zip: nothing to resume"
         )
-    with trust_files():  # a checkpoint there would hold code, too
+    with trust_files():  # a checkpoint there would contain code, too
         begun = load_checked(Experiment, folder / "config.yaml")
     check_inputs(experiment.inputs(), begun.inputs(), where)
     return None
 
 
 def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, Task]:
-    """A new model, what it trains in, and the task that it is validated on; nothing is written.
-
-    Raises:
-        ConfigurationError: a config or environment that does not fit.
-    """
+    """Return a new model, its environment and the task of its validation, without writing."""
     task = make_task(experiment.environment.id, **experiment.environment.options)
     env = make_env(experiment, task)
     return make_model(experiment, env), env, task
@@ -81,10 +72,15 @@ def train(
     resume: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
+    """Run the training and return its summary.
 
-    The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (of
-    all stretches together), the best validation, and a hash of the inputs.
+    The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (over
+    all parts of the training), the best validation, and a hash of the inputs.
+
+    Args:
+        experiment: the config.
+        resume: whether to continue the training in the output folder.
+        quiet: whether to print neither progress nor summary.
 
     Raises:
         ConfigurationError: a config, environment or folder that does not fit; a config that is not
@@ -95,7 +91,7 @@ def train(
         raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
     model, env, scored = check_run(experiment)
     experiment = experiment.resolved(env.task.settings, env.task.sensors)
-    earlier(experiment, folder, resume)  # refuses before anything is made
+    earlier(experiment, folder, resume)  # refuses before it creates a folder
     torch.set_num_threads(experiment.training.threads)
     with alone_in(folder, "output"):
         journal = earlier(experiment, folder, resume)
@@ -117,7 +113,7 @@ def _learn(
     experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
     journal: Journal, quiet: bool,
 ) -> dict[str, Any]:  # fmt: skip
-    """Train what remains, write the results and return the summary."""
+    """Train the remaining steps, write the results and return the summary."""
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
     total, begun, began = experiment.training.timesteps, model.num_timesteps, time.perf_counter()
     with (
@@ -132,7 +128,7 @@ def _learn(
                 model.learn(total - begun, CallbackList(callbacks), reset_num_timesteps=False)
             except Stop:
                 pass
-            except ValueError:  # what torch's distributions make of weights that are not finite
+            except ValueError:  # torch's distributions refuse infinite weights
                 if all(bool(part.isfinite().all()) for part in model.policy.parameters()):
                     raise
                 raise ConfigurationError(
@@ -165,7 +161,7 @@ def _learn(
 
 
 def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
-    """What a reader wants to know of a training, in a few lines."""
+    """Return the summary of a training as text in a few lines."""
     lines = [
         f"{'finished' if summary['finished'] else 'interrupted'} after {summary['timesteps']:,} "
         f"steps at {summary['steps_per_second']:,} steps/s; this stretch: {elapsed:.0f} s"

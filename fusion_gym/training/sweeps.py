@@ -12,10 +12,9 @@ from fusion_gym.training.checked import Strict
 
 
 class SweepCurve(Strict):
-    """A baseline swept over one parameter: ``policy`` holds ``{value}`` in its place.
+    """A baseline with one swept parameter, whose place in ``policy`` is ``{value}`` or ``{price}``.
 
-    Or ``{price}``: the values are then multiples of the task's price, or of the middle of its
-    range.
+    With ``{price}`` the values are multiples of the task's price, or of the middle of its range.
     """
 
     label: str
@@ -23,7 +22,7 @@ class SweepCurve(Strict):
     values: tuple[float | int, ...] = pydantic.Field(min_length=1)
 
     def policies(self, price: Price) -> list[str]:
-        """One policy text a value."""
+        """Return one policy text per value."""
         name = "{price}" if "{price}" in self.policy else "{value}"
         middle = float(price.draw(np.array([0.5]))[0]) if name == "{price}" else 1.0
         return [self.policy.replace(name, f"{middle * value:g}") for value in self.values]
@@ -37,19 +36,19 @@ class SweepCurve(Strict):
 
 
 class Sweep(Strict):
-    """Baselines over their thresholds, and the single policies that stand beside them."""
+    """Baselines with their swept parameters, and single policies."""
 
     curves: tuple[SweepCurve, ...]
     points: tuple[str, ...] = ()
 
     def policies(self, price: Price) -> list[str]:
-        """Every policy text of the sweep, each once, in order."""
+        """Return every policy text of the sweep once, in order."""
         texts = [text for curve in self.curves for text in curve.policies(price)]
         return list(dict.fromkeys([*self.points, *texts]))
 
 
 class ComparisonRow(Strict):
-    """One policy in one setting of the comparison's environment, or of another."""
+    """One policy in one setting of the comparison's environment, or of another environment."""
 
     label: str
     policy: str

@@ -1,1 +1,1 @@
-"""Analytic policies, from signals to requests, one rule or pair of rules a file."""
+"""Trigger rules from signals to requests, one rule or pair of rules per module."""

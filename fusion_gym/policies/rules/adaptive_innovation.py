@@ -20,16 +20,15 @@ from fusion_gym.policies.base import (
 class AdaptiveInnovation(Rule):
     r"""Request when |ε|² >= a exp(-(b + c |ε at the last request|)), with ε the innovation.
 
-    After a large innovation a sensor becomes easier to provoke. Before an episode's first request
-    the remembered innovation is zero.
+    A large innovation lowers the threshold. Before the first request of an episode the stored
+    innovation is zero.
 
-    The rule decides at the sensor, so a request moves the threshold whether or not the network
-    grants it: what it remembers may be a measurement that was never delivered. In the paper every
-    request is granted. The printed exponent -b + c |ε| contradicts the text, which wants a
-    decreasing function.
+    The rule decides at the sensor, so a request changes the threshold even if the network denies
+    it. In the paper every request is granted. The printed exponent -b + c |ε| contradicts the
+    paper's text, which requires a decreasing function.
 
     Args:
-        threshold: a >= 0, in squared units of the measurement; 0 requests always.
+        threshold: a >= 0, in squared units of the measurement; 0 always requests.
         offset: b >= 0, without unit.
         sensitivity: c >= 0, in the inverse unit of the measurement; 0 is a fixed threshold.
 
@@ -39,10 +38,10 @@ class AdaptiveInnovation(Rule):
         a_i\exp\left(-b_i-c_i\,|\varepsilon_i(l_i)|\right)
         $$
 
-        ε is the innovation, lᵢ the step of the sensor's last request, before which ε counts as 0. a
-        is ``threshold``, b ``offset``, c ``sensitivity``.
+        ε is the innovation, lᵢ the step of the sensor's last request; before the first request
+        ε(lᵢ) is 0. a is ``threshold``, b ``offset``, c ``sensitivity``.
 
-    Assumes: a prediction of the measurement at the sensor, and that requests are granted.
+    Assumes: a prediction of the measurement at the sensor, and a network that grants all requests.
 
     Source: adaptive_innovation, equations (9)-(11), defaults of Section 6.
 
@@ -55,17 +54,20 @@ class AdaptiveInnovation(Rule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """A sensor's own measurement, and its size at the last request unless that is ignored."""
+        """A sensor's measurement, with memory of its last request unless the sensitivity is 0."""
         return "own_memory" if np.any(np.asarray(self.sensitivity) > 0.0) else "own"
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget the last requested innovations."""
+        """Clear the last requested innovations."""
         self._last: Array | None = None
 
     def threshold_after(self, last: Array) -> Array:
-        """The threshold θ on |ε|² after requests at innovations of size ``last``, (sensors, N).
+        """Return the threshold on |ε|² after requests at innovations of size ``last``.
 
-        Source: adaptive_innovation, equation (10), with the sign that the text asks for.
+        Source: adaptive_innovation, equation (10), with the sign of the paper's text.
+
+        Args:
+            last: size of the innovation at the last request (sensors, N).
         """
         sensors = len(last)
         exponent = self.column("sensitivity", sensors) * last
@@ -73,7 +75,7 @@ class AdaptiveInnovation(Rule):
         return self.column("threshold", sensors) * np.exp(-exponent)
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         squared = surprise(signals)
         if self._last is None:
             self._last = np.zeros(squared.shape)

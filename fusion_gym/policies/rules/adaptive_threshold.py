@@ -12,14 +12,14 @@ from fusion_gym.policies.base import PerSensor, Requests, Rule, parameter, shape
 
 @dataclass
 class AdaptiveThreshold(Rule):
-    r"""Request when |σ|² > ρ, with σ the measurement minus the last delivered one.
+    r"""Request when |σ|² > ρ, with σ the measurement minus the last delivered measurement.
 
     The threshold follows ρ' = ρ̄ + |σ|²/(λ + |σ|²) (ρ - ρ̄) in every step, with σ before the
-    transmission: it only rises, from ρ₀ at an episode's start to ρ̄.
+    transmission. It rises from ρ₀ at an episode's start towards ρ̄.
 
-    While every request is granted, |σ|² <= ρ̄ wherever nothing was sent. σ is taken against the
-    last delivery and not the last request, so that this also holds again after a denied request
-    is repeated. The measurement at time 0 counts as delivered.
+    While every request is granted, |σ|² <= ρ̄ at every step without a transmission. σ refers to the
+    last delivery, not to the last request, so the bound holds again after the grant of a repeated
+    request. The measurement at time 0 counts as delivered.
 
     Args:
         rho_bar: ρ̄, the limit of the threshold, in squared units of the measurement.
@@ -44,8 +44,8 @@ class AdaptiveThreshold(Rule):
         ȳᵢ is the last delivered measurement. ρ̄ is ``rho_bar``, ρ₀ ``rho_initial``, λ
         ``adaptation``; ``scale`` multiplies ρ̄ and ρ₀.
 
-    Assumes: a centre that holds the last delivered value, and for the bound ρ̄ that every
-    request is granted.
+    Assumes: a centre that holds the last delivered value, and for the bound ρ̄ a network that
+    grants every request.
 
     Source: unknown_input, equations (5)-(7), defaults of Section 4.
 
@@ -63,25 +63,29 @@ class AdaptiveThreshold(Rule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """A sensor's own measurement, and what it did not send unless the threshold is constant."""
+        """A sensor's measurement, with memory unless the threshold is constant."""
         initial, limit = np.asarray(self.rho_initial), np.asarray(self.rho_bar)
         return "own" if self.scale == 0.0 or bool(np.all(initial == limit)) else "own_memory"
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget the thresholds."""
+        """Clear the thresholds."""
         self._rho: Array | None = None
 
     def threshold_after(self, rho: Array, squared: Array) -> Array:
-        """The threshold that follows ρ once |σ|² has been judged by it, all (sensors, N).
+        """Return the next threshold (sensors, N).
 
         Source: unknown_input, equation (7).
+
+        Args:
+            rho: present threshold ρ (sensors, N).
+            squared: |σ|² before the transmission (sensors, N).
         """
         limit = self.scale * self.column("rho_bar", len(rho))
         share = squared / (self.column("adaptation", len(rho)) + squared)
         return limit + share * (rho - limit)
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         sensors, runs = shape_of(signals)
         initial = self.scale * self.column("rho_initial", sensors)
         start = signals["start"]

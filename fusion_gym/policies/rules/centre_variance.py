@@ -1,4 +1,4 @@
-"""Transmit until the centre's own predicted uncertainty is small enough."""
+"""Transmit until the centre's predicted variance is small enough."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,13 +12,12 @@ from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, s
 class CentreVariance(Rule):
     r"""Request the fewest sensors, by greedy choice, that bring the fused trace below a threshold.
 
-    The trace is that of the fused covariance after the step, in squared units of the state. If it
-    is at least θ without any packet, the sensor that lowers it most is requested; if it still is,
-    the one that lowers it most in addition; and so on. It looks at no measurement, so without a
-    token limit it is a schedule.
+    The trace is the trace of the fused covariance after the step, in squared units of the state.
+    While it is at least θ, the rule adds the sensor that lowers it most. The rule uses no
+    measurement, so without a token limit it is a schedule.
 
-    Unlike the rule ``variance_threshold`` it takes the plain
-    trace, and it knows what several packets bring together.
+    Unlike the rule ``variance_threshold`` it uses the unweighted trace and the joint effect of
+    several packets.
 
     Args:
         threshold: θ >= 0, in squared units of the state.
@@ -31,13 +30,14 @@ class CentreVariance(Rule):
         \mathrm{tr}\,P_{S_k}\ge\theta
         $$
 
-        The last of these sets is requested. P_S is the fused covariance of this step after the
+        The rule requests the last of these sets. P_S is the fused covariance of this step after the
         packets of S, θ is ``threshold``; at most ``at_most`` sensors are added.
 
-    Assumes: claimed covariances that are true; what was measured plays no part.
+    Assumes: claimed covariances that are true.
 
-    Source: the threshold is that of S. Trimpe and R. D'Andrea, "Event-based state estimation with
-    variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the choice is ours.
+    Source: the threshold is from S. Trimpe and R. D'Andrea, "Event-based state estimation with
+    variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the greedy choice is from
+    this library.
 
     Example: ``centre_variance:threshold=2.5`` in ``fusion_gym/MarkovJumpTracking-v1``.
     """
@@ -47,6 +47,6 @@ class CentreVariance(Rule):
     knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         before = signals["greedy_variance"]
         return strongest(before, before >= self.threshold, self.at_most, signals["age"])

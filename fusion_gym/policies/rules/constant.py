@@ -1,4 +1,4 @@
-"""Always and never: the ends of the trade-off."""
+"""Always and never, the extreme rates."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -20,7 +20,7 @@ class Always(Rule):
 
     Assumes: nothing.
 
-    Source: none; the end of the trade-off at which everything is sent that the tokens pay for.
+    Source: none; the highest rate that the tokens allow.
 
     Example: ``always`` in ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True
     tokens=unlimited``.
@@ -29,7 +29,7 @@ class Always(Rule):
     knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
-        """All true, (sensors, N)."""
+        """Return requests of all sensors (sensors, N)."""
         return np.ones(shape_of(signals), dtype=np.bool_)
 
 
@@ -44,7 +44,7 @@ class Never(Rule):
 
     Assumes: nothing.
 
-    Source: none; the end of the trade-off at which the centre only predicts.
+    Source: none; the rate 0, at which the centre only predicts.
 
     Example: ``never`` in ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True
     token_rate=2``.
@@ -53,5 +53,5 @@ class Never(Rule):
     knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
-        """All false, (sensors, N)."""
+        """Return no requests (sensors, N)."""
         return np.zeros(shape_of(signals), dtype=np.bool_)

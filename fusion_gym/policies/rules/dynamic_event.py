@@ -23,10 +23,9 @@ from fusion_gym.policies.base import (
 class DynamicEvent(Rule):
     r"""Request when |ε| >= η/χ + σ, with ε the last requested minus the current measurement.
 
-    The dynamic variable
-    follows η' = λ η + σ - |ε|, where ε is zero after a request, and is clipped at zero: the
-    condition λ χ > 1 that would keep it positive is violated by the paper's own numbers. It
-    remembers measurements that were not requested, and ε those that were denied.
+    The dynamic variable follows η' = λ η + σ - |ε|, where ε is zero after a request. It is clipped
+    at zero, because the paper's numbers violate the condition λ χ > 1 for a positive η. η depends
+    on measurements without a request, and ε on requests that the network denied.
 
     Args:
         threshold: σ >= 0, in the unit of the measurement.
@@ -46,11 +45,11 @@ class DynamicEvent(Rule):
         \eta_i(0)=\eta_{0,i}
         $$
 
-        εᵢ is the last requested measurement minus the present one. σ is ``threshold``, λ ``decay``,
-        χ ``divisor``, η₀ ``initial``; ``scale`` multiplies σ and η₀.
+        εᵢ is the last requested measurement minus the present measurement. σ is ``threshold``, λ
+        ``decay``, χ ``divisor``, η₀ ``initial``; ``scale`` multiplies σ and η₀.
 
-    Assumes: a centre that holds the last delivered value, and that requests are granted: ε is
-    taken against the last request.
+    Assumes: a centre that holds the last delivered value, and a network that grants all requests,
+    since ε refers to the last request.
 
     Source: tobit_token_bucket, equations (11)-(15).
 
@@ -66,12 +65,12 @@ class DynamicEvent(Rule):
     knowledge: ClassVar[Knowledge] = "own_memory"
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget the dynamic variable and the last requested measurements."""
+        """Clear the dynamic variable and the last requested measurements."""
         self._eta: Array | None = None
         self._requested: Array | None = None
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         sensors, runs = shape_of(signals)
         sigma = self.scale * self.column("threshold", sensors)
         initial = self.scale * self.column("initial", sensors)

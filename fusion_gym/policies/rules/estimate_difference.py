@@ -1,4 +1,4 @@
-"""Transmit when the estimate that could be made differs enough from the centre's."""
+"""Transmit when the best estimate differs enough from the centre's estimate."""
 
 from dataclasses import dataclass
 
@@ -14,18 +14,18 @@ from fusion_gym.policies.belief_rule import BeliefRule
 
 @dataclass
 class EstimateDifference(BeliefRule):
-    r"""Request when |x* - x̂| >= ``threshold``; of the sensors, those of the highest value.
+    r"""Request the sensors of the highest value when ‖x* - x̂‖ >= ``threshold``.
 
-    x* is the estimate that could be made and x̂ the centre's if nobody transmits
-    (:mod:`fusion_gym.core.beliefs`). The norm is weighted as in the reward, by weights of mean 1,
-    in the unit of the states. With ``own`` and without memory it is a threshold on what a sensor's
-    own measurement would change.
+    x* is the best estimate and x̂ the centre's estimate without transmissions
+    (:mod:`fusion_gym.core.beliefs`). The norm has the weights of the reward, scaled to a mean of 1,
+    and the unit of the states. With ``own`` and without memory it is the change of the estimate by
+    the sensor's own measurement.
 
     Args:
-        own: every sensor decides locally, by its memory and what it receives.
+        own: every sensor decides locally, by its memory and the broadcasts.
         threshold: θ >= 0, in the unit of the states, or without a unit.
         whitened: weigh by the inverse of the centre's claimed covariance.
-        at_most: most sensors requested in a step, those of the highest value; None for no limit.
+        at_most: most requests in a step, by the highest value; None for no limit.
 
     Raises:
         ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
@@ -37,14 +37,14 @@ class EstimateDifference(BeliefRule):
         highest value}\ v(s)
         $$
 
-        x* is the best estimate that could be made, x̂ the centre's if nobody transmits, W weights
-        of mean 1 as in the reward (with ``whitened`` P⁻¹, P the centre's covariance of x̂), θ
+        x* is the best estimate, x̂ the centre's estimate without transmissions, W the reward's
+        weights with mean 1 (with ``whitened`` P⁻¹, P the centre's covariance of x̂), θ
         ``threshold``, v as in
         :class:`~fusion_gym.policies.rules.value_of_information.ValueOfInformation`; ``at_most``
-        sensors are requested. With ``own`` every sensor compares the x* and the x̂ that it knows.
+        sensors are requested. With ``own`` every sensor compares its own x* and x̂.
 
-    Assumes: x* is the conditional mean given all that its owner knows: the error is then that
-    of x*, which no decision changes, plus the squared difference.
+    Assumes: x* is the conditional mean given the knowledge of its owner. The squared error is then
+    the squared error of x*, which no decision changes, plus the squared difference.
 
     Sources: Y. Xu and J. P. Hespanha, "Optimal communication logics in networked control systems",
     IEEE CDC 2004; G. M. Lipsa and N. C. Martins, "Remote state estimation with communication costs
@@ -59,7 +59,7 @@ class EstimateDifference(BeliefRule):
     at_most: int | None = parameter(1, check_at_most)
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         beliefs, age = self.beliefs(signals), signals["age"]
         squared = _whitened(beliefs) if self.whitened else beliefs.loss()
         requests = np.broadcast_to(squared >= self.threshold * self.threshold, age.shape)
@@ -69,6 +69,6 @@ class EstimateDifference(BeliefRule):
 
 
 def _whitened(beliefs: Beliefs) -> Array:
-    """(x* - x̂)ᵀ P⁻¹ (x* - x̂), P the covariance that the centre claims of x̂; (k, N)."""
+    """Return (x* - x̂)ᵀ P⁻¹ (x* - x̂), with P the centre's covariance of x̂ (k, N)."""
     difference, covariance = beliefs.difference, beliefs.silent.covariance
     return linalg.dot(difference, linalg.solve_vector(covariance, difference))

@@ -1,4 +1,4 @@
-"""Greedy choice by predicted reduction of variance per token."""
+"""Greedy choice by the predicted reduction of variance per token."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,12 +12,12 @@ from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, s
 class InformationGain(Rule):
     r"""Request where the relative reduction of the fused trace per token is >= ``threshold``.
 
-    The reduction is that of a delivery from this sensor alone, relative to the trace without any
-    delivery; it does not depend on the measurement.
+    The reduction is the effect of a single delivery from this sensor, relative to the trace without
+    deliveries. It does not depend on the measurement.
 
     Args:
-        threshold: θ >= 0, the least relative reduction for each token.
-        at_most: most sensors requested in a step, those of the highest gain; None for no limit.
+        threshold: θ >= 0, the least relative reduction per token.
+        at_most: most requests in a step, by the highest gain; None for no limit.
 
     Equation:
         $$
@@ -25,14 +25,13 @@ class InformationGain(Rule):
         P_\varnothing)},\qquad \delta_i(t)=1\Rightarrow g_i\ge\theta
         $$
 
-        Of those that reach θ (``threshold``), the ``at_most`` of the highest gain. P_∅ is the fused
-        covariance of this step if nobody transmits and P_{i} if sensor i alone does, W the reward's
-        weights of the states, c the tokens that a transmission costs.
+        The rule requests the ``at_most`` sensors of the highest gain that reach θ (``threshold``).
+        P_∅ is the fused covariance of this step without transmissions, P_{i} with a transmission
+        of sensor i only, W the reward's weights of the states, c the tokens of a transmission.
 
-    Assumes: claimed covariances that are true, and that what counts is the next step alone.
+    Assumes: claimed covariances that are true, and that only the next step counts.
 
-    Source: none; the greedy choice of sensors by predicted variance, here in proportion to the
-    tokens that it costs.
+    Source: none; the greedy choice of sensors by predicted variance, here per token.
 
     Example: ``information_gain:threshold=0.2`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
@@ -43,7 +42,7 @@ class InformationGain(Rule):
     knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         relative = signals["variance_reduction"] / signals["silent_variance"]
         gain = relative / signals["token_cost"]
         return strongest(gain, gain >= self.threshold, self.at_most, signals["age"])

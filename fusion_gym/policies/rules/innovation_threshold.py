@@ -1,4 +1,4 @@
-"""Transmit when the measurement surprises the filter."""
+"""Transmit when the innovation is large."""
 
 from dataclasses import dataclass
 
@@ -20,14 +20,12 @@ from fusion_gym.policies.base import (
 
 @dataclass
 class InnovationThreshold(Rule):
-    r"""Request when the innovation's norm is at least ``threshold``.
-
-    The norm is Euclidean.
+    r"""Request when the Euclidean norm of the innovation is at least ``threshold``.
 
     Args:
         threshold: θ >= 0, in the unit of the measurement, or without a unit.
         whitened: take the innovation in predicted standard deviations.
-        at_most: most sensors requested in a step, those of the largest norms; None for no limit.
+        at_most: most requests in a step, by the largest norm; None for no limit.
 
     Equation:
         $$
@@ -35,11 +33,11 @@ class InnovationThreshold(Rule):
         $$
 
         ŷᵢ is the predicted measurement, θ is ``threshold``; with ``whitened`` each component of z
-        is divided by its predicted standard deviation. With ``at_most``, those of the largest
-        norms.
+        is divided by its predicted standard deviation. With ``at_most``, the sensors of the largest
+        norms are requested.
 
     Assumes: a prediction of the measurement at the sensor; with ``whitened`` also that its
-    predicted deviation is true. Silence is taken for no information by the filters here.
+    predicted deviation is true. The filters treat silence as no information.
 
     Source: after J. Wu, Q.-S. Jia, K. H. Johansson and L. Shi, "Event-based sensor data
     scheduling: trade-off between communication rate and estimation quality", IEEE Trans.
@@ -55,11 +53,11 @@ class InnovationThreshold(Rule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """A sensor's own measurement; with ``at_most`` all of them, for the largest is sent."""
+        """The class of a sensor, or with ``at_most``, which compares sensors, of a scheduler."""
         return "own" if self.at_most is None else "scheduler"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         norm = np.sqrt(surprise(signals, self.whitened))
         requests = norm >= self.column("threshold", len(norm))
         return strongest(norm, requests, self.at_most, signals["age"])

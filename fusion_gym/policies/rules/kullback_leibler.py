@@ -1,4 +1,4 @@
-"""Transmit when what could be known diverges from what the centre will claim."""
+"""Transmit when the centre's densities with and without a packet diverge."""
 
 from dataclasses import dataclass
 
@@ -14,18 +14,17 @@ from fusion_gym.policies.belief_rule import BeliefRule
 
 @dataclass
 class KullbackLeibler(BeliefRule):
-    r"""Request where the divergence of the centre's two densities is at least ``threshold`` nats.
+    r"""Request where a packet's divergence of the centre's density is at least ``threshold`` nats.
 
-    D(s) = ½ (tr P⁻¹ P_s - n + δᵀ P⁻¹ δ + ln det P - ln det P_s): from the Gaussian N(x̂(s), P_s)
-    that the centre would hold after the packet of s alone to N(x̂, P), its prediction, with
-    δ = x̂(s) - x̂. With ``own`` and memory x*, with all that the sensor remembers, stands for x̂(s).
-    It counts what a packet teaches, variance included, whether or not the estimate moves.
+    D(s) = ½ (tr P⁻¹ P_s - n + δᵀ P⁻¹ δ + ln det P - ln det P_s), with δ = x̂(s) - x̂, is the
+    divergence from N(x̂(s), P_s) to N(x̂, P). The former is the centre's density after the packet of
+    s only, the latter its prediction. With ``own`` the best estimate x*, which has the sensor's
+    memory, replaces x̂(s). D counts a reduction of the variance even if the mean does not change.
 
     Args:
-        own: every sensor decides by itself.
+        own: every sensor decides locally, by its memory and the broadcasts.
         threshold: θ >= 0, in nats.
-        at_most: most sensors requested in a step, those of the highest divergence; None for no
-            limit.
+        at_most: most requests in a step, by the highest divergence; None for no limit.
 
     Raises:
         ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
@@ -37,8 +36,8 @@ class KullbackLeibler(BeliefRule):
         T}P^{-1}\delta+\ln\frac{\det P}{\det P_s}\right)\ge\theta,\qquad \delta=\hat x(s)-\hat x
         $$
 
-        N(x̂, P) is the centre's density if nobody transmits, N(x̂(s), P_s) after the packet of s
-        alone, n the number of states, θ ``threshold`` in nats.
+        N(x̂, P) is the centre's density without transmissions, N(x̂(s), P_s) after the packet of s
+        only, n the number of states, θ ``threshold`` in nats.
 
     Assumes: Gaussian densities, and claimed covariances that are true.
 
@@ -53,14 +52,14 @@ class KullbackLeibler(BeliefRule):
     at_most: int | None = parameter(None, check_at_most)
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         beliefs = self.beliefs(signals)
         divergence = _divergence(beliefs.best if self.own else beliefs.sent, beliefs.silent)
         return strongest(divergence, divergence >= self.threshold, self.at_most, signals["age"])
 
 
 def _divergence(estimate: Estimate, silent: Estimate) -> Array:
-    """From one Gaussian to another, in nats (sensors, N)."""
+    """Return the divergence from one Gaussian to another, in nats (sensors, N)."""
     difference = estimate.mean - silent.mean
     size = difference.shape[-2]
     spread = linalg.trace(linalg.solve(silent.covariance, estimate.covariance))

@@ -1,4 +1,4 @@
-"""The variance trigger of the Markov jump paper: transmit when the node itself is uncertain."""
+"""The variance trigger of the Markov jump paper."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,23 +12,22 @@ from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, par
 class LocalVariance(Rule):
     r"""Request where the trace of the node's error covariance is at least ``reference`` + ``m``.
 
-    The traces depend on time alone, so the rule is a schedule that becomes
-    periodic, whatever is measured, and it prefers the worst node.
+    The traces depend only on time and deliveries, so the rule is a schedule that becomes periodic.
+    It prefers the nodes of the largest trace.
 
     Args:
         m: distance to the reference, in squared units of the state, of any sign.
-        reference: trace that the fusion of all nodes reaches at full rate; the environment supplies
-            it.
+        reference: trace of the fusion of all nodes at full rate, by default from the environment.
 
     Equation:
         $$
         \delta_i(t)=1\iff \mathrm{tr}\,P_i(t)\ge P_{\mathrm{ref}}+m_i
         $$
 
-        Pᵢ is the node's own error covariance, P_ref ``reference``.
+        Pᵢ is the node's error covariance, P_ref ``reference``.
 
-    Assumes: node covariances that depend on time alone, as those of linear filters do, so that
-    centre and node know them both.
+    Assumes: node covariances that do not depend on the data, as with linear filters, so centre and
+    node both know them.
 
     Source: markov_jump, equation (33).
 
@@ -40,7 +39,7 @@ class LocalVariance(Rule):
     knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         variance = signals["local_variance"]
         result: Requests = variance >= self.reference + self.column("m", len(variance))
         return result

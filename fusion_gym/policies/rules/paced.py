@@ -9,24 +9,24 @@ from fusion_gym import validation
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, parameter, shape_of
 
-# A pace that comes up at a step may be computed a rounding below it: 49 · (1/49) < 1.
+# Rounding may delay a request by a step: 49 · (1/49) < 1.
 _ROUNDING = 1e-9
 
 
 @dataclass
 class Paced(Rule):
-    r"""Request each sensor at ``rate``, its requests spread as evenly as possible.
+    r"""Request each sensor at ``rate``, with its requests spread as evenly as possible.
 
-    A sensor requests at step t, counted from 0, where ⌊(t + 1) r + φ⌋ > ⌊t r + φ⌋ with its rate r.
-    In every window of n steps it makes less than one request more or
-    fewer than n r. The phases φ are i/sensors for sensor i if ``staggered``, and 0 otherwise.
+    A sensor of rate r requests at the steps t = 0, 1, … with ⌊(t + 1) r + φ⌋ > ⌊t r + φ⌋. Its
+    number of requests in n successive steps differs from n r by less than one. The phase φ of
+    sensor i is i/sensors if ``staggered``, and 0 otherwise.
 
-    For r = 1/period this is ``periodic`` but for the phase. It is what an event trigger of the same
-    rate has to beat.
+    For r = 1/period the rule equals ``periodic`` up to the phase. It is the baseline for an event
+    trigger of the same rate.
 
     Args:
         rate: r in [0, 1], any real number.
-        staggered: spread sensors of one rate evenly among each other too.
+        staggered: spread the phases of the sensors evenly.
 
     Equation:
         $$
@@ -36,7 +36,7 @@ class Paced(Rule):
 
         r is ``rate``, l the number of sensors, i counts from 0; all φ are 0 without ``staggered``.
 
-    Assumes: nothing; it looks at the clock alone.
+    Assumes: nothing; it uses only the clock.
 
     Source: none; the balanced sequence of a rate r, ⌊(t + 1) r + φ⌋ - ⌊t r + φ⌋.
 
@@ -49,7 +49,7 @@ class Paced(Rule):
     knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         sensors, _ = shape_of(signals)
         rate, step = self.column("rate", sensors), signals["step"]
         phase = np.full((sensors, 1), _ROUNDING)

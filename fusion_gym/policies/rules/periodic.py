@@ -1,4 +1,4 @@
-"""Time-triggered policies: they look at the clock and at the order of the last grants."""
+"""Time-triggered policies, which use the clock and the order of the last grants."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -16,7 +16,7 @@ class Periodic(Rule):
 
     Args:
         period: steps between two requests of a sensor, >= 1.
-        staggered: spread the sensors over the period; otherwise all request together.
+        staggered: spread the sensors over the period; otherwise all sensors request together.
 
     Equation:
         $$
@@ -27,9 +27,9 @@ class Periodic(Rule):
         p is ``period``, l the number of sensors, i counts from 0; all φ are 0 without
         ``staggered``.
 
-    Assumes: nothing; it looks at the clock alone.
+    Assumes: nothing; it uses only the clock.
 
-    Source: none; what an event trigger is usually compared with.
+    Source: none; the usual baseline of an event trigger.
 
     Example: ``periodic:period=15`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
@@ -40,7 +40,7 @@ class Periodic(Rule):
     knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         sensors, _ = shape_of(signals)
         phase = np.arange(sensors) * self.period // sensors if self.staggered else np.zeros(sensors)
         return (signals["step"] - phase[:, None]) % self.period == 0
@@ -48,7 +48,7 @@ class Periodic(Rule):
 
 @dataclass
 class RoundRobin(Rule):
-    r"""Request one sensor after another every ``period`` steps, the next one after a grant.
+    r"""Request one sensor every ``period`` steps, and the next sensor after a grant.
 
     Args:
         period: steps between two requests, >= 1.
@@ -62,10 +62,9 @@ class RoundRobin(Rule):
         p is ``period``, k(t) the number of grants before step t, l the number of sensors, i counts
         from 0.
 
-    Assumes: nothing; it looks at the clock and at the network's answers to its own requests.
+    Assumes: nothing; it uses the clock and the network's answers to its requests.
 
-    Source: round_robin_tobit, equation (4), for the protocol in which one sensor a step may
-    transmit.
+    Source: round_robin_tobit, equation (4), a protocol in which one sensor per step may transmit.
 
     Example: ``round_robin:period=5`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
@@ -75,5 +74,5 @@ class RoundRobin(Rule):
     knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         return (signals["queue"] == 0) & (signals["step"] % self.period == 0)

@@ -1,4 +1,4 @@
-"""Transmit above a threshold that follows price, tokens and age."""
+"""Transmit above a threshold that depends on price, tokens and age."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, get_args
@@ -32,7 +32,7 @@ def _price(name: str, value: float | None) -> None:
 
 
 class ThresholdNumbers(NamedTuple):
-    """The searched numbers of :class:`PricedThreshold`, (sensors, 1); or of every run (…, N)."""
+    """The searched numbers of :class:`PricedThreshold`, (sensors, 1), or (…, N) for N runs."""
 
     threshold: Array
     price_exponent: Array
@@ -45,34 +45,33 @@ class ThresholdNumbers(NamedTuple):
 
 @dataclass
 class PricedThreshold(BeliefRule):
-    r"""Request where a mixture of value and loss reaches a threshold that follows the price.
+    r"""Request where a mixture of value and loss reaches a threshold that depends on the price.
 
-    It is a learned policy of a dozen numbers that one can read: a search
-    (:mod:`fusion_gym.evaluation.rule_search`) sets them for all prices at once, in the place of
-    one threshold for each price.
+    A search (:mod:`fusion_gym.evaluation.rule_search`) sets its dozen numbers for all prices at
+    once, instead of one threshold for each price.
 
     Args:
-        own: every sensor decides locally, by its memory and what it receives.
-        score: what v and l are. ``"value"``: the expected value of a packet and the squared norm of
-            the difference of the two estimates (:mod:`fusion_gym.core.beliefs`). ``"innovation"``:
-            the squared norm of the innovation, v in predicted standard deviations, l in the unit
-            of the measurement. ``"variance"``: the fall of the fused trace by a packet, and that
-            trace without any packet, which the centre predicts.
+        own: every sensor decides locally, by its memory and the broadcasts.
+        score: v and l. ``"value"``: the expected value of a packet and the squared norm of x* - x̂
+            (:mod:`fusion_gym.core.beliefs`). ``"innovation"``: the squared norm of the innovation,
+            v in predicted standard deviations, l in the unit of the measurement. ``"variance"``:
+            the reduction of the fused trace by a packet, and the trace without packets, both
+            predicted by the centre.
         threshold: θ >= 0 at the reference price, for all sensors or for each, in the unit of the
             score.
         price_exponent: β, for all sensors or for each; 1 is proportional to the price.
-        price: of a token; None for the price in the reward, also where each episode draws its own.
+        price: price of a token; None for the price in the reward, which an episode may draw.
         reference_price: p₀ > 0.
-        mixture: m from 0, v alone, to 1, l alone.
+        mixture: m, from 0 (v only) to 1 (l only).
         token_exponent: κ; above 0 few tokens lower the threshold, below 0 they raise it.
         age_exponent: α; above 0 a long silence raises the threshold, below 0 it lowers it.
         margin: s >= 1, the factor by which each further sensor in the same step must exceed its
-            threshold at the reference price; 1 for none.
+            threshold at the reference price; 1 for no margin.
         margin_exponent: μ; above 0 the margin grows with the price, and is never below 1.
 
     Raises:
         ConfigurationError: a value that is not allowed, a margin with ``own``, ``own`` with the
-            variance, or a task whose policies do not see the sensors (but with the variance).
+            variance, or, except with the variance, a task whose policies do not see the sensors.
 
     Equation:
         $$
@@ -81,16 +80,16 @@ class PricedThreshold(BeliefRule):
         \delta_i(t)=1\iff v_i>0,\ r_i\ge\max\{1,s\,(p/p_0)^\mu\}^{k_i}
         $$
 
-        vᵢ and l are the ``score``, p is the price of a token, b the tokens of at most b̄ (their
-        ratio is 1 where tokens are unlimited), aᵢ the steps since the last delivery, kᵢ the number
-        of sensors of a larger r in this step. θ is ``threshold``, β ``price_exponent``, p₀
-        ``reference_price``, m ``mixture``, κ ``token_exponent``, α ``age_exponent``, s ``margin``,
-        μ ``margin_exponent``.
+        vᵢ and l are the ``score``, p is the price of a token, b the tokens and b̄ their capacity
+        (the ratio is 1 where tokens are unlimited). aᵢ are the steps since the last delivery, kᵢ is
+        the number of sensors with a larger r in this step. θ is ``threshold``, β
+        ``price_exponent``, p₀ ``reference_price``, m ``mixture``, κ ``token_exponent``, α
+        ``age_exponent``, s ``margin``, μ ``margin_exponent``.
 
-    Assumes: what the rules of its score assume, ``value_of_information``,
+    Assumes: the assumptions of the rule of its score, ``value_of_information``,
     ``innovation_threshold`` or ``variance_threshold``; numbers that were searched for this task.
 
-    Source: none; the scores belong to the three rules above, the powers are ours.
+    Source: none; the scores are from these three rules, the powers from this library.
 
     Example: ``priced_threshold:threshold=0.03,reference_price=0.02`` in
     ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True token_rate=2 cost_weight=0.01
@@ -123,13 +122,13 @@ class PricedThreshold(BeliefRule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """By the score, by the task's memory, and by whether sensors are compared."""
+        """The knowledge class, by the score, the task's memory and the comparison of sensors."""
         if self.score == "innovation":
             return "scheduler" if self.margin != 1.0 or self.margin_exponent else "own"
         return "centre" if self.score == "variance" else super().knowledge
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         value, loss = self._scores(signals)
         numbers, bucket, age = self.numbers, self.task.bucket, np.maximum(signals["age"], 0.0)
         price = signals["price"] if self.price is None else np.asarray(self.price)
@@ -151,7 +150,7 @@ class PricedThreshold(BeliefRule):
         return result
 
     def _scores(self, signals: Signals) -> tuple[Array, Array]:
-        """The two scores v (sensors, N) and l (…, N)."""
+        """Return the two scores v (sensors, N) and l (…, N)."""
         if self.score == "innovation":
             return surprise(signals, whitened=True), surprise(signals)
         if self.score == "variance":

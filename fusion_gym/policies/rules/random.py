@@ -7,7 +7,7 @@ from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, parameter, shape_of
 from fusion_gym.policies.chance import Chance
 
-_STREAM = 0x72616E646F6D  # keeps the requests apart from the noise of the same seed
+_STREAM = 0x72616E646F6D  # makes requests independent of the noise of the same seed
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Random(Rule):
 
     Assumes: nothing; requests are independent of everything.
 
-    Source: none; what an event trigger is usually compared with.
+    Source: none; a usual baseline of an event trigger.
 
     Example: ``random:rate=0.07`` in ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True
     token_rate=2``.
@@ -40,10 +40,10 @@ class Random(Rule):
         super().__post_init__()
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Begin again: run i draws from a stream of its own, that of ``seed + i``."""
+        """Restart the random streams; run i draws from the stream of ``seed + i``."""
         self._chance.reset(runs, seed)
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         sensors, runs = shape_of(signals)
         return self._chance.draw(sensors, runs) < self.column("rate", sensors)

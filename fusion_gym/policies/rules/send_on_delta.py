@@ -1,4 +1,4 @@
-"""Send on delta: transmit when the measurement has moved."""
+"""Send on delta: transmit when the measurement has changed enough."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -17,7 +17,7 @@ from fusion_gym.policies.base import (
 
 @dataclass
 class SendOnDelta(Rule):
-    r"""Request when |y - last delivered y| >= ``threshold``, in the unit of the measurement.
+    r"""Request when the measurement differs from the last delivered one by ``threshold`` or more.
 
     Args:
         threshold: θ >= 0, in the unit of the measurement.
@@ -29,8 +29,8 @@ class SendOnDelta(Rule):
 
         ȳᵢ is the last delivered measurement of sensor i, θ is ``threshold``.
 
-    Assumes: a centre that holds the last delivered value: the threshold then bounds how far it
-    is off.
+    Assumes: a centre that holds the last delivered value. The threshold then bounds the error of
+    the held value.
 
     Source: M. Miskowicz, "Send-on-delta concept: an event-based data reporting strategy",
     Sensors 6, 2006.
@@ -43,7 +43,7 @@ class SendOnDelta(Rule):
     knowledge: ClassVar[Knowledge] = "own"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         moved = signals["measurement"] - signals["held"]
         threshold = self.column("threshold", shape_of(signals)[0])
         return linalg.dot(moved, moved) >= threshold * threshold

@@ -1,4 +1,4 @@
-"""Stay silent by chance, the less likely the more the measurement surprises the filter."""
+"""A stochastic trigger: the probability of silence falls with the size of the innovation."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -17,18 +17,16 @@ from fusion_gym.policies.base import (
 )
 from fusion_gym.policies.chance import Chance
 
-_STREAM = 0x73746F6368  # keeps the draws apart from the noise of the same seed
+_STREAM = 0x73746F6368  # makes draws independent of the noise of the same seed
 
 
 @dataclass
 class StochasticEvent(Rule):
-    r"""Keep each sensor silent with probability exp(-w |z|² / 2), z its innovation.
+    r"""Keep each sensor silent with probability exp(-w |z|² / 2), with z its innovation.
 
-    The weight w is the paper's Z, here a multiple of the identity for each sensor.
-
-    The silence is a soft event: given silence the posterior stays Gaussian, and
-    ``filter="stochastic"`` is the exact filter for it (of the plain
-    innovation, not of the whitened one).
+    The weight w is the paper's Z, here a multiple of the identity for each sensor. Given silence
+    the posterior stays Gaussian. ``filter="stochastic"`` is the exact filter, for the innovation
+    without ``whitened``.
 
     Args:
         weight: w >= 0, in the inverse squared unit of the measurement, or without a unit; 0 never
@@ -45,7 +43,7 @@ class StochasticEvent(Rule):
         deviation.
 
     Assumes: a prediction of the measurement at the sensor; for the exact posterior a linear
-    Gaussian system, uncensored sensors and requests that are all granted.
+    Gaussian system, uncensored sensors and a network that grants all requests.
 
     Source: D. Han, Y. Mo, J. Wu, S. Weerakkody, B. Sinopoli and L. Shi, "Stochastic
     event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control
@@ -64,11 +62,11 @@ class StochasticEvent(Rule):
         super().__post_init__()
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Begin again: run i draws from a stream of its own, that of ``seed + i``."""
+        """Restart the random streams; run i draws from the stream of ``seed + i``."""
         self._chance.reset(runs, seed)
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         squared = surprise(signals, self.whitened)
         silence = np.exp(-0.5 * self.column("weight", len(squared)) * squared)
         return self._chance.draw(*squared.shape) >= silence

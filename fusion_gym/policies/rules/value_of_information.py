@@ -1,4 +1,4 @@
-"""Transmit what is worth it: the change of the estimate that a packet brings, against a price."""
+"""Transmit a packet whose expected improvement of the estimate exceeds a price or threshold."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,19 +19,19 @@ def _optional(name: str, value: float | None) -> None:
 
 @dataclass
 class ValueOfInformation(BeliefRule):
-    r"""Request the sensors whose transmission is worth at least ``threshold``, or its ``price``.
+    r"""Request the sensors whose packet has a value of at least ``threshold``, or of its price.
 
-    v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖² with x* the estimate that could be made, x̂ the centre's if
-    nobody transmits and x̂(s) if s alone does (:mod:`fusion_gym.core.beliefs`): with memory x*
-    holds all that was measured and not sent, without it this step's measurements. The norm has
-    the reward's weights, of mean 1. It is the strongest rule in most settings, above all with
-    memory.
+    The value is v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖². x* is the best estimate, x̂ the centre's estimate
+    without transmissions and x̂(s) its estimate after the packet of s only
+    (:mod:`fusion_gym.core.beliefs`). With memory x* uses all unsent measurements, without memory
+    the measurements of this step. The norm has the weights of the reward, scaled to a mean of 1. In
+    most settings this is the strongest rule, above all with memory.
 
     Args:
-        own: every sensor decides locally, by its memory and what it receives.
-        threshold: θ >= 0, in squared units of the states; 0.03 where no price is given either.
-        price: of a token, in the reward's units, in the place of the threshold.
-        at_most: most sensors requested in a step, those of the highest value; None for no limit.
+        own: every sensor decides locally, by its memory and the broadcasts.
+        threshold: θ >= 0, in squared units of the states; 0.03 without a price.
+        price: price of a token in the reward's units, instead of the threshold.
+        at_most: most requests in a step, by the highest value; None for no limit.
         steps: steps ahead over which the distances are summed, without noise and further
             transmissions.
 
@@ -45,16 +45,17 @@ class ValueOfInformation(BeliefRule):
         \delta_s(t)=1\Rightarrow v(s)\ge\theta
         $$
 
-        x* is the best estimate that could be made, x̂ the centre's if nobody transmits, x̂(s) if s
-        alone transmits; the expectation is over the packet's arrival. W are weights of mean 1 as in
-        the reward, θ is ``threshold``. With ``price`` p in its place, v in the reward's units must
-        reach p times the tokens of the transmission. Of those, the ``at_most`` of the highest
-        value; with ``steps`` h the squares are summed over h steps ahead.
+        x* is the best estimate, x̂ the centre's estimate without transmissions, x̂(s) its estimate
+        after a transmission of s only; the expectation is over the packet's arrival. W are the
+        reward's weights with mean 1, θ is ``threshold``. With ``price`` p instead, v in the
+        reward's units must reach p times the tokens of the transmission. With ``at_most``, the
+        sensors of the highest value are requested; with ``steps`` h the squares are summed over h
+        steps ahead.
 
-    Assumes: x* is the conditional mean given all that its owner knows, and that what counts is
-    the next ``steps`` steps.
+    Assumes: x* is the conditional mean given the knowledge of its owner, and only the next
+    ``steps`` steps count.
 
-    Sources: see :mod:`fusion_gym.core.beliefs`.
+    Sources: :mod:`fusion_gym.core.beliefs` lists them.
 
     Example: ``value_of_information:threshold=0.03,at_most=1`` in ``fusion_gym/TobitOscillator-v1
     filter=tobit random_start=True token_rate=2 memory=True``.
@@ -75,7 +76,7 @@ class ValueOfInformation(BeliefRule):
             )
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         value = self.beliefs(signals).value(self.steps)
         if self.price is None:
             least = np.asarray(0.03 if self.threshold is None else self.threshold)

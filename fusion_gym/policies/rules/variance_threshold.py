@@ -1,4 +1,4 @@
-"""Transmit when the centre's own uncertainty is too large."""
+"""Transmit when the centre's predicted variance is too large."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,14 +12,13 @@ from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, s
 
 @dataclass
 class VarianceThreshold(Rule):
-    r"""Request when the fused covariance without any transmission would have a trace >= threshold.
+    r"""Request when the trace of the fused covariance without transmissions reaches ``threshold``.
 
-    It looks at no measurement.
+    The rule uses no measurement.
 
     Args:
         threshold: θ >= 0, in squared units of the state.
-        at_most: most sensors requested in a step, those that reduce the trace most; None for no
-            limit.
+        at_most: most requests in a step, by the largest reduction of the trace; None for no limit.
 
     Equation:
         $$
@@ -27,11 +26,11 @@ class VarianceThreshold(Rule):
         of the largest}\ \ \mathrm{tr}(W P_\varnothing)-\mathrm{tr}(W P_{\{i\}})
         $$
 
-        P_∅ is the fused covariance of this step if nobody transmits and P_{i} if sensor i alone
-        does, W the reward's weights of the states, θ ``threshold``; ``at_most`` sensors are
-        requested.
+        P_∅ is the fused covariance of this step without transmissions, P_{i} with a transmission
+        of sensor i only, W the reward's weights of the states, θ ``threshold``; ``at_most`` sensors
+        are requested.
 
-    Assumes: claimed covariances that are true; what was measured plays no part.
+    Assumes: claimed covariances that are true.
 
     Source: after S. Trimpe and R. D'Andrea, "Event-based state estimation with variance-based
     triggering", IEEE Trans. Automatic Control 59, 2014.
@@ -45,7 +44,7 @@ class VarianceThreshold(Rule):
     knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
+        """Return the requests (sensors, N)."""
         reduction = signals["variance_reduction"]
         due = np.broadcast_to(signals["silent_variance"] >= self.threshold, reduction.shape)
         return strongest(reduction, due, self.at_most, signals["age"])

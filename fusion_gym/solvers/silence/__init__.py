@@ -1,4 +1,4 @@
-"""When silence is best, once all else is given away: a lower bound of every policy's error."""
+"""A lower bound of every policy's error, by the optimal times of silence in a relaxed problem."""
 
 from fusion_gym.solvers.silence.bound import PricedCost, SilenceBound, cost_bound, silence_bound
 from fusion_gym.solvers.silence.induction import SilenceSolution, solve_silence

@@ -13,19 +13,23 @@ from fusion_gym.solvers.silence.induction import SilenceSolution, solve_silence
 from fusion_gym.solvers.silence.model import SilenceModel, silence_model
 from fusion_gym.solvers.silence.simulation import simulate
 
-_ROUGH_STEP = 0.15  # of the root of the price: enough to find the price of a rate
+_ROUGH_STEP = 0.15  # in units of the root of the price, for the search of the price
 _ROUGH_EPISODES = 4000
-_SPAN = 1e7  # of the prices looked at, relative to each other
-_CLOSE = 0.02  # of the logarithm of the price: the bound is flat there
+_SPAN = 1e7  # ratio of the largest to the smallest price
+_CLOSE = 0.02  # tolerance of the logarithm of the price; the bound is flat at its maximum
 
 
 @dataclass(frozen=True)
 class PricedCost:
-    """The least cost of an episode's step, error and packets, at a ``price`` of a packet.
+    """Bounds of the least cost per step, error and packets, at a ``price`` of a packet.
 
-    It is proven to be at least ``lower``; ``upper``, with three standard errors in it, is what the
-    policy of the lattices costs, which transmits at ``rate`` (a sensor and step). ``step`` and
-    ``points`` are those of the lattices.
+    Args:
+        price: price of a packet.
+        lower: proven lower bound.
+        upper: cost of the lattice policy plus three standard errors.
+        rate: transmissions of this policy per sensor and step.
+        step: step of the lattices.
+        points: points of the largest lattice.
     """
 
     price: float
@@ -37,16 +41,18 @@ class PricedCost:
 
     @property
     def gap(self) -> float:
-        """How far the least cost may lie above ``lower``, as a share of it."""
+        """``upper`` minus ``lower``, as a share of ``lower``."""
         return (self.upper - self.lower) / self.lower
 
 
 @dataclass(frozen=True)
 class SilenceBound:
-    """What no policy can undercut.
+    """A lower bound of the error of every policy.
 
-    ``floor`` is the error where everything is known to the centre at once, averaged over an
-    episode's steps; ``costs`` are in the order of their prices.
+    Args:
+        floor: error of a centre that knows everything at once, averaged over an episode's steps.
+        sensors: number of sensors.
+        costs: bounds in the order of their prices.
     """
 
     floor: float
@@ -54,7 +60,7 @@ class SilenceBound:
     costs: tuple[PricedCost, ...]
 
     def at(self, rate: float) -> tuple[float, PricedCost]:
-        """The bound at a rate (transmissions a sensor and step), and the price that shows it."""
+        """Return the bound at a rate (transmissions per sensor and step), and its price."""
         packets = rate * self.sensors
         result = [(cost.lower - cost.price * packets, cost) for cost in self.costs]
         best, table = max(result, key=lambda row: row[0])
@@ -68,18 +74,22 @@ def silence_bound(
     accuracy: float = 0.01,
     most_points: int = 3_000_000,
 ) -> SilenceBound:
-    """Bound the error of every policy of the task from below, best at these rates.
+    """Bound the error of every policy of the task from below, most tightly at these rates.
 
-    The error is Σᵢ Wᵢ (xᵢ - x̂ᵢ)², averaged over an episode's steps, W = ``weights`` (n,), by
-    default 1: the MSE that an evaluation prints. No policy that transmits at a rate at most, with
-    whatever tokens, knowledge of the past and filter for what arrives, has less.
+    The error is Σᵢ Wᵢ (xᵢ - x̂ᵢ)², averaged over an episode's steps, the MSE of an evaluation. The
+    bound holds for every policy up to the rate, with any tokens, any knowledge of the past and any
+    filter of the deliveries.
 
-    The lattices are so fine that the bound loses about ``accuracy``, relatively, as far as
-    ``most_points`` allow; what was reached is each cost's ``gap``.
+    Args:
+        task: the task.
+        rates: transmissions per sensor and step, in (0, 1].
+        weights: W (n,); 1 by default.
+        accuracy: approximate relative loss of the bound, unless ``most_points`` limits the
+            lattices; the ``gap`` of each cost is the result.
+        most_points: largest number of points of a lattice.
 
     Raises:
-        ConfigurationError: a task to which the bound does not apply, or a value that is not
-            allowed.
+        ConfigurationError: a task without this bound, or a value that is not allowed.
     """
     model = silence_model(task, weights)
     required = [validation.number("rates", rate, above=0.0, at_most=1.0) for rate in rates]
@@ -98,12 +108,17 @@ def cost_bound(
 ) -> PricedCost:
     """Bound the cost of every policy of the task from below, at a price of a token.
 
-    The cost is error + price · tokens of a step, in the reward's units. Every packet costs
-    as much as the cheapest one.
+    The cost is error + price · tokens per step, in the reward's units. Every packet costs as much
+    as the cheapest packet.
+
+    Args:
+        task: the task.
+        price: price of a token, > 0.
+        accuracy: approximate relative loss of the bound.
+        most_points: largest number of points of a lattice.
 
     Raises:
-        ConfigurationError: a task to which the bound does not apply, or a value that is not
-            allowed.
+        ConfigurationError: a task without this bound, or a value that is not allowed.
     """
     model = silence_model(task, task.error_scale * task.relative_weights[:, 0])
     packet = validation.number("price", price, above=0.0) * float(task.bucket.cost.min())
@@ -114,10 +129,7 @@ def cost_bound(
 
 
 def _price(model: SilenceModel, packets: float) -> tuple[float, SilenceSolution]:
-    """A price at which about so many packets a step are best, and its solution on a rough lattice.
-
-    Any price gives a bound; this one a good one.
-    """
+    """Return a price with about so many optimal packets per step, and its rough solution."""
     typical = float(np.einsum("tii,i->", model.problem.noise, model.problem.weights))
     typical /= model.problem.horizon
     solved: dict[float, tuple[float, SilenceSolution]] = {}
@@ -149,7 +161,7 @@ def _cost(
     accuracy: float,
     most_points: int,
 ) -> PricedCost:
-    """Both sides of the least cost at a price, on lattices for this accuracy at this rate."""
+    """Return bounds of the least cost at a price, on lattices for this accuracy at this rate."""
     problem = replace(model.problem, price=price)
     size, coarse = problem.size, rough.stages[0].step
     bound = max(model.floor + rough.lower - price * rate * model.sensors, model.floor)

@@ -18,8 +18,8 @@ from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.solvers.silence.survival import Survival
 from fusion_gym.validation import ConfigurationError
 
-_TAIL = 1e-15  # more than the probability of the noise's tails, with their rounding
-_MOST_POINTS = 20_000_000  # of one step's lattice
+_TAIL = 1e-15  # upper bound of the probability of the noise's tails, with rounding
+_MOST_POINTS = 20_000_000  # of one lattice
 _DEVIATIONS = np.array([0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0])
 _BALANCES = np.geomspace(1.0 / 16.0, 16.0, 9)[:, None]
 _SHARES = np.linspace(0.05, 0.95, 19)[:, None, None, None]
@@ -27,12 +27,16 @@ _SHARES = np.linspace(0.05, 0.95, 19)[:, None, None, None]
 
 @dataclass(frozen=True)
 class Stage:
-    """What is known of one time: coordinates, lattice of this ``step``, where silence may be best.
+    """The solution at one time, on a lattice of the step ``step``.
 
-    ``silent`` (n,) are the semi-axes, in the coordinates, of an ellipsoid that holds every such e.
-    ``gain`` (points along each axis) is the least cost from here on, less ``ceiling``, the cost
-    after a packet's price; it is 0 off the lattice. ``floor`` is no more than the least cost after
-    a packet without its price.
+    Args:
+        coordinates: coordinates of the lattice.
+        step: distance of its points.
+        silent: semi-axes (n,) of an ellipsoid, in the coordinates, with every e at which silence
+            may be best.
+        gain: least cost from here on minus ``ceiling`` (points along each axis); 0 off the lattice.
+        ceiling: least cost after a packet, plus its price.
+        floor: lower bound of the least cost after a packet, without its price.
     """
 
     coordinates: Coordinates
@@ -50,9 +54,9 @@ class Stage:
 
 @dataclass(frozen=True)
 class SilenceSolution:
-    """No policy of the problem costs less than ``lower`` a step on average.
+    """A lower bound ``lower`` of the average cost per step of every policy of the problem.
 
-    ``stages`` are those of t = 1..H; ``points`` is the number of points of the largest lattice.
+    ``stages`` belong to t = 1..H; ``points`` is the number of points of the largest lattice.
     """
 
     lower: float
@@ -61,9 +65,9 @@ class SilenceSolution:
 
 
 class _Expectation:
-    """E of the next time's value at A e + w, from below; ``middle`` is that at e = 0.
+    """A lower bound of E of the next value at A e + w, with its value ``middle`` at e = 0.
 
-    The cost after a packet is at most by ``rise`` higher at the time before.
+    The cost after a packet is at most by ``rise`` higher at the previous time.
     """
 
     def __init__(self, stage: Stage, price: float) -> None:
@@ -77,17 +81,19 @@ class _Expectation:
         self.rise = max(self.middle - stage.floor, 0.0) + _TAIL * price
 
     def within(self, deviations: float) -> Array:
-        """Semi-axes (B, n) of ellipsoids, each around all points that near the silent set.
+        """Return semi-axes (B, n) of ellipsoids, each around all points near the silent set.
 
-        A sum of two ellipsoids, that of the silent set and that of the noise at so many deviations,
-        lies in each.
+        Each ellipsoid contains the sum of the silent set and the ellipsoid of the noise.
+
+        Args:
+            deviations: size of the ellipsoid of the noise, in standard deviations.
         """
         silent = self.stage.silent**2
         noise = deviations**2 * self.stage.coordinates.variance
         return np.sqrt((1.0 + 1.0 / _BALANCES) * silent + (1.0 + _BALANCES) * noise)
 
     def at(self, points: Array) -> Array:
-        """The expectation (M,) at ``points`` A e (n, M)."""
+        """Return the expectation (M,) at ``points`` A e (n, M)."""
         places = (self.stage.coordinates.inverse / self.stage.step) @ points
         near = np.ones(points.shape[1], dtype=np.bool_)
         for place, half in zip(places, self.half, strict=True):
@@ -101,9 +107,12 @@ class _Expectation:
 def solve_silence(problem: SilenceProblem, step: float) -> SilenceSolution:
     """Bound the least cost from below, on lattices of this ``step``.
 
-    The step is in units of the root of the cost: half the second derivative of the value is at most
-    1 in every direction of the lattices' coordinates, so a step h costs up to about n h²/3 a step
-    of time.
+    In every direction of the lattice coordinates, half the second derivative of the value is at
+    most 1. A step h therefore costs up to about n h²/3 per step of time.
+
+    Args:
+        problem: the problem.
+        step: distance of the points, in units of the root of the cost.
 
     Raises:
         ConfigurationError: a lattice would have more than 20 million points.
@@ -133,7 +142,7 @@ def solve_silence(problem: SilenceProblem, step: float) -> SilenceSolution:
 def _half(
     problem: SilenceProblem, coordinates: Coordinates, step: float, ahead: _Expectation | None
 ) -> NDArray[np.int64]:
-    """Points on each side of the middle that hold every e at which silence may be best."""
+    """Return the points on each side of the middle that contain every e of optimal silence."""
     price, weight = problem.price, coordinates.basis.T * problem.weights @ coordinates.basis
     if ahead is None:
         width = extents(weight / price)
@@ -142,8 +151,8 @@ def _half(
         to_next = ahead.stage.coordinates.inverse @ problem.transition @ coordinates.basis
         width = np.full(problem.size, np.inf)
         for deviations in _DEVIATIONS.tolist():
-            # Where the noise brings A e back to silence with less than this probability, silence
-            # is not best unless it costs less than the rise.
+            # If the noise returns A e to the silent set with less than this probability, silence
+            # is best only if it costs less than the rise.
             returns = price * float(ndtr(-deviations)) + rise
             axes = ahead.within(deviations)  # (B, n), several ellipsoids around the others
             again = (to_next.T / axes[:, None] ** 2) @ to_next
@@ -160,7 +169,7 @@ def _stage(
     step: float,
     ahead: _Expectation | None,
 ) -> Stage:
-    """One step backwards."""
+    """Return the solution one step backwards."""
     place = nodes(half, step)
     error = np.tensordot(coordinates.basis, place, 1)
     silent = np.tensordot(problem.weights, error**2, 1)
@@ -168,7 +177,7 @@ def _stage(
         known = silent <= problem.price + ahead.rise  # elsewhere silence is not best
         silent[known] += ahead.at(problem.transition @ error[:, known])
         silent[~known] = np.inf
-    between = 0.25 * problem.size * step**2  # by which the cost may be less between points
+    between = 0.25 * problem.size * step**2  # largest reduction of the cost between points
     # At the last step the cost of silence is known, and least at 0.
     floor = 0.0 if ahead is None else float(silent.min()) - between
     ceiling = problem.price + floor
@@ -181,6 +190,6 @@ def _stage(
 
 
 def _ellipsoid(corners: Array) -> Array:
-    """Semi-axes (n,) of an ellipsoid around the boxes whose half widths are ``corners`` (n, M)."""
+    """Return semi-axes (n,) of an ellipsoid around the boxes of half widths ``corners`` (n, M)."""
     width = corners.max(1)
     return np.asarray(width * np.sqrt(((corners / width[:, None]) ** 2).sum(0).max()))

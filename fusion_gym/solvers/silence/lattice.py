@@ -1,4 +1,4 @@
-"""Points at which the value is known, in coordinates in which noise and curvature are diagonal."""
+"""Lattices of the value, in coordinates with diagonal noise and curvature."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
 
-REACH = 8.5  # deviations of the noise beyond which nothing arrives: 1e-17 of it
+REACH = 8.5  # deviations of the noise up to a probability of 1e-17
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """e = ``basis`` z with Sᵀ-weighted length 1 in every direction and independent noise.
+    """Coordinates e = ``basis`` z with unit curvature in every direction and independent noise.
 
     ``basis`` T (n, n) has Tᵀ S T = I and T⁻¹ Σ T⁻ᵀ = diag(``variance``) (n,); ``inverse`` is T⁻¹.
     """
@@ -27,7 +27,7 @@ class Coordinates:
 
     @classmethod
     def create(cls, curvature: Array, noise: Array) -> Coordinates:
-        """The coordinates of a positive definite S and a positive semi-definite Σ, both (n, n)."""
+        """Return the coordinates of a positive definite S and a positive semi-definite Σ (n, n)."""
         root = np.linalg.cholesky(curvature)
         values, vectors = np.linalg.eigh(root.T @ noise @ root)
         basis = np.linalg.solve(root.T, vectors)
@@ -35,22 +35,32 @@ class Coordinates:
 
 
 def extents(form: Array) -> Array:
-    """Half widths (..., n) of the boxes around {zᵀ F z <= 1}, F (..., n, n)."""
+    """Return half widths (..., n) of the boxes around {zᵀ F z <= 1}, F (..., n, n)."""
     return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(form), axis1=-2, axis2=-1)))
 
 
 def nodes(half: NDArray[np.int64], step: float) -> Array:
-    """Half of the lattice from -half to half (n,): points (n, half[0] + 1, 2 half[1] + 1, …)."""
+    """Return half of the lattice from -half to half (n,).
+
+    The points have the shape (n, half[0] + 1, 2 half[1] + 1, …).
+
+    Args:
+        half: points on each side of the middle, by axis (n,).
+        step: distance of the points.
+    """
     axes = [step * np.arange(-count, count + 1) for count in half]
     axes[0] = axes[0][half[0] :]
     return np.stack(np.meshgrid(*axes, indexing="ij"))
 
 
 def hat_weights(deviation: float, count: int) -> Array:
-    """Weights (count + 1,) of the points 0, 1, …: E max(1 - |X - k|, 0), X ~ N(0, deviation²).
+    """Return the weights of the points 0, 1, …: E max(1 - |X - k|, 0), X ~ N(0, deviation²).
 
-    They are what linear interpolation between the whole numbers makes of X: the mean stays, the
-    variance grows.
+    They result from linear interpolation between the integers: the mean stays, the variance grows.
+
+    Args:
+        deviation: standard deviation of X.
+        count: last point.
     """
     if deviation == 0.0:
         return np.eye(1, count + 1)[0]
@@ -62,10 +72,13 @@ def hat_weights(deviation: float, count: int) -> Array:
 
 
 def spread_values(values: Array, deviations: Array) -> tuple[Array, float]:
-    """Σ of the hat weights times ``values``, on a larger lattice, and the variance that they add.
+    """Return Σ of the hat weights times ``values`` on a larger lattice, and the added variance.
 
-    ``values`` (points along each axis) are 0 outside; ``deviations`` (n,) and the variance, which
-    is summed over the axes, in units of the lattice's step.
+    Deviations and the added variance, a sum over the axes, are in units of the lattice's step.
+
+    Args:
+        values: values (points along each axis), 0 outside.
+        deviations: standard deviations of the noise (n,).
     """
     added = 0.0
     for axis, deviation in enumerate(deviations.tolist()):
@@ -83,10 +96,13 @@ def spread_values(values: Array, deviations: Array) -> tuple[Array, float]:
 
 
 def interpolated(values: Array, places: Array) -> tuple[Array, Array]:
-    """Multilinear interpolation of ``values`` at ``places`` (n, M), and Σᵢ xᵢ (1 - xᵢ) (M,).
+    """Return the multilinear interpolation of ``values`` at ``places``, and Σᵢ xᵢ (1 - xᵢ) (M,).
 
-    Both places and x, the parts of a step by which they lie beyond a point, in steps from the
-    middle of the lattice; every place is inside.
+    x is the fractional part of a place. All places are inside the lattice.
+
+    Args:
+        values: values (points along each axis).
+        places: places (n, M), in steps from the middle of the lattice.
     """
     middle = (np.array(values.shape) - 1) // 2
     part = places - np.floor(places)

@@ -1,4 +1,4 @@
-"""What a task leaves to decide once censoring and tokens are given away, and where it may be."""
+"""The relaxed problem of a task, without censoring and token limits, and its conditions."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +23,7 @@ from fusion_gym.validation import ConfigurationError
 
 @dataclass(frozen=True)
 class SilenceModel:
-    """The task's problem at a price of 1, and the ``floor`` under its error, a mean over steps."""
+    """The task's problem at a price of 1, and the ``floor`` of its error, a mean over steps."""
 
     problem: SilenceProblem
     floor: float
@@ -31,14 +31,18 @@ class SilenceModel:
 
 
 def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
-    """The Kalman filter of all uncensored measurements, the first one included.
+    """Return the problem of the Kalman filter of all uncensored measurements, the first included.
 
-    Its covariances P(t) are the floor, and its corrections, of covariance P⁻(t) - P(t), are the
-    noise of what the centre does not know. ``weights`` (n,) are by default 1.
+    Its covariances P(t) are the floor. Its corrections, of covariance P⁻(t) - P(t), are the noise
+    of the information that the centre lacks.
+
+    Args:
+        task: the task.
+        weights: weights of the states (n,); 1 by default.
 
     Raises:
-        ConfigurationError: a task whose centre does other things in silence than to predict with
-            the plant's own matrix, or weights that are not all above 0.
+        ConfigurationError: a task whose centre does not predict with the plant's matrix in silence,
+            or weights that are not all above 0.
     """
     system = _system(task)
     plant, sensors = system.plant, system.centre.sensors
@@ -59,7 +63,7 @@ def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
 
 
 def _update(prior: Array, matrix: Array, noise: Array) -> tuple[Array, Array]:
-    """The posterior covariance, and that of the correction K (y - C x̂), both (n, n)."""
+    """Return the posterior covariance and the covariance of the correction K (y - C x̂), (n, n)."""
     innovation = matrix @ prior @ matrix.T + noise
     gain = np.linalg.solve(innovation, matrix @ prior).T
     keep = np.eye(len(prior)) - gain @ matrix
@@ -69,7 +73,7 @@ def _update(prior: Array, matrix: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def _system(task: Task) -> CensoredSystem:
-    """The task's system, if the bound applies to it."""
+    """Return the task's system, if the bound applies to it."""
     system: Any = task.system
     if not isinstance(system, CensoredSystem):
         raise ConfigurationError(
@@ -93,7 +97,7 @@ def _system(task: Task) -> CensoredSystem:
 
 
 def _predicts(centre: Centre) -> bool:
-    """Whether A x̂ is all that the centre makes of a step without deliveries."""
+    """Return whether the centre only predicts, by A x̂, in a step without deliveries."""
     if isinstance(centre, SequentialCentre):
         return True
     if not isinstance(centre, NodeCentre):

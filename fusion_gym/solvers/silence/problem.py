@@ -1,4 +1,4 @@
-"""When to be silent: the problem that is left once everything else is given away."""
+"""The problem of optimal silence that remains after all other limits are relaxed."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from fusion_gym.validation import ConfigurationError
 
 @dataclass(frozen=True)
 class SilenceProblem:
-    """How far the centre may be from what the sensors know, at a price for each packet.
+    """The difference between the sensors' and the centre's knowledge, with a price of each packet.
 
-    The difference e starts at 0 and moves as e(t) = A e(t-1) + w(t), w(t) ~ N(0, Σ(t)), for
-    t = 1..H. Each step then costs Σᵢ Wᵢ eᵢ² after silence; a packet costs ``price`` and leaves
-    whatever e is best for the future.
+    The difference e starts at 0 and moves as e(t) = A e(t-1) + w(t), w(t) ~ N(0, Σ(t)), for t =
+    1..H. A silent step then costs Σᵢ Wᵢ eᵢ². A packet costs ``price`` and leaves the e that is best
+    for the future.
 
     Shapes: ``transition`` A (n, n), ``weights`` W (n,), all > 0, ``noise`` Σ (H, n, n), of any
-    rank. Build one with :meth:`create`, which checks its arguments.
+    rank. :meth:`create` builds a checked problem.
     """
 
     transition: Array
@@ -33,12 +33,7 @@ class SilenceProblem:
     def create(
         cls, transition: ArrayLike, weights: ArrayLike, noise: ArrayLike, price: float
     ) -> SilenceProblem:
-        """Check the arrays; ``noise`` is one covariance a step.
-
-        Raises:
-            ConfigurationError: a wrong shape, a weight or a price that is not above 0, or a
-                covariance that is not symmetric positive semi-definite.
-        """
+        """Return the checked problem; ``noise`` is one covariance per step."""
         matrix = validation.array("transition", transition, (None, None))
         size = len(matrix)
         matrix = validation.array("transition", matrix, (size, size))

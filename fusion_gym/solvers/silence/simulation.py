@@ -1,4 +1,4 @@
-"""What the policy of the lattices costs: no less than the least cost, which shows the gap."""
+"""The cost of the lattice policy, an upper bound of the least cost."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ _SURE = 3.0  # standard errors
 
 
 class UpperValue(NamedTuple):
-    """Means over simulated episodes, a step: ``cost`` with its standard error, and packets."""
+    """Means over simulated episodes, per step: ``cost`` with its standard error, and packets."""
 
     cost: float
     deviation: float
@@ -22,14 +22,14 @@ class UpperValue(NamedTuple):
 
     @property
     def high(self) -> float:
-        """The cost is below this, as surely as three standard errors say."""
+        """The cost plus three standard errors."""
         return self.cost + _SURE * self.deviation
 
 
 def simulate(
     problem: SilenceProblem, solution: SilenceSolution, episodes: int = 20_000, seed: int = 0
 ) -> UpperValue:
-    """Run the solution's policy: silent near points where silence is best, 0 after a packet."""
+    """Run the solution's policy: silence near points of optimal silence, e = 0 after a packet."""
     draw = np.random.default_rng(seed)
     error = np.zeros((problem.size, episodes))
     cost, packets = np.zeros(episodes), 0.0
@@ -47,7 +47,7 @@ def simulate(
 
 
 def _sends(stage: Stage, error: Array) -> NDArray[np.bool_]:
-    """Whether a packet is best at the point next to each of the errors (n, M)."""
+    """Return whether a packet is best at the point nearest to each of the errors (n, M)."""
     place = np.rint(stage.coordinates.inverse @ error / stage.step).astype(np.int64)
     place += stage.half[:, None]
     shape = np.array(stage.gain.shape)[:, None]

@@ -1,23 +1,23 @@
-"""How long silence can last, and so how curved the value of being silent can be."""
+"""Bounds of the duration of silence, and of the curvature of its value."""
 
 import numpy as np
 from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
 
-_LOOK = 48  # steps over which one look at the difference is compared with its bounds
+_LOOK = 48  # largest number of steps ahead for a probability of one time
 
 
 class Survival:
     """Upper bounds of the probability of silence, step by step backwards in time.
 
-    Silence at time t needs e(t) in an ellipsoid {|F e| <= 1}. A Gaussian is in a set that is
-    convex and symmetric at most as probably as the one without a mean (T. W. Anderson, "The
-    integral of a symmetric unimodal function", 1955), so whatever e(t) was, the probability of
-    silence at t + 1, …, t + j is at most ρ(j), the least product of such probabilities over any
-    choice of times in between.
+    Silence at time t needs e(t) in an ellipsoid {|F e| <= 1}. Among Gaussians of one covariance,
+    the one of mean 0 gives a convex symmetric set its largest probability (T. W. Anderson, "The
+    integral of a symmetric unimodal function", 1955). Hence, for any e(t), the probability of
+    silence at t + 1, …, t + j is at most ρ(j). ρ(j) is the least product of such probabilities over
+    any choice of times in between.
 
-    ``curvature`` (n, n) is S(t) = Σ ρ(j) (Aʲ)ᵀ W Aʲ over j from 0 on, of the last time added.
+    ``curvature`` (n, n) is S(t) = Σ ρ(j) (Aʲ)ᵀ W Aʲ over j >= 0, for the last added time t.
     """
 
     def __init__(self, transition: Array, weights: Array, horizon: int) -> None:
@@ -34,12 +34,12 @@ class Survival:
 
     @property
     def curvature(self) -> Array:
-        """S(t) of the time to which silence has been followed back."""
+        """S(t) of the last added time t."""
         rho = self._rho[0]
         return np.asarray(np.tensordot(rho, self._grams[: len(rho)], 1))
 
     def add(self, ellipsoid: Array, noise: Array) -> None:
-        """Go back a step: F (n, n) of the silent set {|F e| <= 1}, and the noise Σ of time t."""
+        """Go back one step, with F (n, n) of the silent set {|F e| <= 1} and the noise Σ."""
         size = len(noise)
         self._ellipsoids.insert(0, ellipsoid)
         self._noises.insert(0, noise)
@@ -52,7 +52,7 @@ class Survival:
         once = _inside(np.array(self._ellipsoids[:looks]), stretched)
         longest = len(self._rho[0])
         rho = np.ones(longest + 1)
-        for j in range(looks):  # after the first look at time t + 1 + j
+        for j in range(looks):  # the first time is t + 1 + j
             later = self._rho[j]
             reach = longest + 1 - (j + 1)
             rho[j + 1 :] = np.minimum(rho[j + 1 :], once[j] * later[:reach])
@@ -61,7 +61,7 @@ class Survival:
 
 
 def _inside(ellipsoids: Array, covariances: Array) -> Array:
-    """Upper bounds (J,) of P(|F z| <= 1), z ~ N(0, Γ): those of the box around each ellipsoid."""
+    """Return upper bounds (J,) of P(|F z| <= 1), z ~ N(0, Γ), by the box around each ellipsoid."""
     variances = np.linalg.eigvalsh(ellipsoids @ covariances @ np.swapaxes(ellipsoids, -1, -2))
     deviations = np.sqrt(np.maximum(variances, 1e-300))
     return np.asarray(np.prod(2.0 * ndtr(1.0 / deviations) - 1.0, axis=-1))
