@@ -98,9 +98,9 @@ class WorkPiece(Protocol):
     """A piece of work: all inputs of its result, and its seconds on one core."""
 
     @property
-    def inputs(self) -> dict[str, Any]: ...
+    def inputs(self) -> dict[str, Any]: ...  # noqa: D102
     @property
-    def weight(self) -> float: ...
+    def weight(self) -> float: ...  # noqa: D102
 
 
 def missing(
@@ -119,7 +119,7 @@ def _fill(cache: Cache, function: Callable[[Any], Any], piece: WorkPiece) -> Non
     cache.call(function, piece.inputs, piece)
 
 
-def side_by_side(work: Sequence[Call], pool: Pool, description: str) -> list[Any]:
+def run_parallel(work: Sequence[Call], pool: Pool, description: str) -> list[Any]:
     """Run the work in the pool with progress, and return the results in the work's order."""
     if not work:
         return []

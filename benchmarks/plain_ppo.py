@@ -95,7 +95,7 @@ class Row:
     best: tuple[str, float]
     shares: dict[str, tuple[float, float]]
 
-    def shown(self) -> list[str]:
+    def cells(self) -> list[str]:
         """Return the cells of the table."""
         ends = (f"{rule} ({value:.4g})" for rule, value in (self.simple, self.best))
         shares = (f"{likeliest:.2f} · {drawn:.2f}" for likeliest, drawn in self.shares.values())
@@ -119,22 +119,22 @@ def main() -> None:
     with report_errors():
         for name in arguments.settings or SETTINGS:
             choice("setting", name, SETTINGS)
-            table.add_row(*judge(name, arguments).shown())
+            table.add_row(*judge(name, arguments).cells())
             tables.console().print(table)
 
 
 def judge(name: str, arguments: argparse.Namespace) -> Row:
     """Return the row of a setting, from stored pieces or a run."""
     setting, folder = SETTINGS[name], arguments.output / name
-    asked = {"episodes": arguments.episodes}
-    run = partial(run_rules, setting, **asked)
-    rules, seconds = piece(folder / "rules.json", arguments.resume, run, asked)
+    inputs = {"episodes": arguments.episodes}
+    run = partial(run_rules, setting, **inputs)
+    rules, seconds = piece(folder / "rules.json", arguments.resume, run, inputs)
     simple, best = (max(names, key=rules.__getitem__) for names in (SIMPLE, rules))
-    asked |= {name: getattr(arguments, name) for name in ("timesteps", "gamma", "n_steps")}
+    inputs |= {name: getattr(arguments, name) for name in ("timesteps", "gamma", "n_steps")}
     shares = {}
-    for title, (shown, seed) in TRAININGS.items():
-        run = partial(train, setting, shown, seed, **asked)
-        agent, more = piece(folder / f"{title}.json", arguments.resume, run, asked)
+    for title, (cells, seed) in TRAININGS.items():
+        run = partial(train, setting, cells, seed, **inputs)
+        agent, more = piece(folder / f"{title}.json", arguments.resume, run, inputs)
         likeliest, drawn = (
             (agent[way] - rules[simple]) / (rules[best] - rules[simple]) for way in WAYS
         )
@@ -144,13 +144,13 @@ def judge(name: str, arguments: argparse.Namespace) -> Row:
 
 
 def piece(
-    path: Path, resume: bool, run: Callable[[], Returns], asked: dict[str, Any]
+    path: Path, resume: bool, run: Callable[[], Returns], inputs: dict[str, Any]
 ) -> tuple[Returns, float]:
     """Return the result of ``run``, or a stored one, and its processor seconds."""
     stored = json.loads(path.read_text()) if resume and path.exists() else {}
-    if stored.get("asked") != asked:
+    if stored.get("asked") != inputs:
         before = time.process_time()
-        stored = {"asked": asked, "returns": run(), "seconds": time.process_time() - before}
+        stored = {"asked": inputs, "returns": run(), "seconds": time.process_time() - before}
         write(path, stored)
     return stored["returns"], stored["seconds"]
 
@@ -164,11 +164,11 @@ def run_rules(setting: Setting, episodes: int) -> Returns:
 
 
 def train(
-    setting: Setting, shown: dict[str, Any], seed: int, *, episodes: int, timesteps: int,
+    setting: Setting, cells: dict[str, Any], seed: int, *, episodes: int, timesteps: int,
     gamma: float, n_steps: int,
 ) -> Returns:  # fmt: skip
     """Return the mean return of a training's agent, for likeliest and drawn actions."""
-    options = setting.options | shown
+    options = setting.options | cells
     env = make_sb3_vec_env(
         setting.environment, num_envs=64, seed=seed, training_error="mismatch", **options
     )

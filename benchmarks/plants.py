@@ -69,7 +69,7 @@ class Row:
     least: float
     most: float
 
-    def shown(self) -> list[str]:
+    def cells(self) -> list[str]:
         """Return the cells of the table."""
         shares = (f"{value:.0%}" for value in (self.lowest, self.highest))
         differences = (f"{value:+.1%}" for value in astuple(self)[4:])
@@ -90,7 +90,7 @@ def main() -> None:
     with report_errors():
         for name in arguments.plants or PLANTS:
             choice("plant", name, PLANTS)
-            table.add_row(*judge(name, arguments).shown())
+            table.add_row(*judge(name, arguments).cells())
             tables.console().print(table)
 
 

@@ -34,7 +34,7 @@ class UnexpectedArgumentError(ConfigurationError, TypeError):
     """An unknown argument, also a ``TypeError``, as Stable-Baselines3 and TorchRL expect it."""
 
     @classmethod
-    def of(cls, owner: str, name: str, reason: str) -> UnexpectedArgumentError:
+    def for_argument(cls, owner: str, name: str, reason: str) -> UnexpectedArgumentError:
         """Return the error for the argument ``name`` of ``owner``, in Python's own words."""
         return cls(f"{owner} got an unexpected keyword argument {name!r}: {reason}")
 
@@ -58,17 +58,17 @@ def display(value: Any) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
-def _plain(value: Any, shown: Iterator[int]) -> Any:
+def _plain(value: Any, counter: Iterator[int]) -> Any:
     """Return a value with arrays as lists, cut after ``_SHOWN`` entries."""
-    if next(shown) > _SHOWN:
+    if next(counter) > _SHOWN:
         return ...
     if isinstance(value, np.ndarray):
         return (value[:_SHOWN] if value.ndim else value).tolist()
     if type(value) in (list, tuple):
-        return type(value)(_plain(entry, shown) for entry in value[:_SHOWN])
+        return type(value)(_plain(entry, counter) for entry in value[:_SHOWN])
     if type(value) is dict:
         entries = itertools.islice(value.items(), _SHOWN)
-        return {key: _plain(entry, shown) for key, entry in entries}
+        return {key: _plain(entry, counter) for key, entry in entries}
     return value
 
 

@@ -205,7 +205,7 @@ def arguments(owner: str, value: Iterable[str], known: Iterable[str]) -> None:
     names = sorted(known)
     for key in value:
         if key not in names:
-            raise UnexpectedArgumentError.of(
+            raise UnexpectedArgumentError.for_argument(
                 owner, key, f"unknown option {key!r}: {_known(key, names)}"
             )
 
@@ -262,7 +262,7 @@ def runs(value: Any) -> int:
     return integer("num_envs", value, at_least=1, at_most=MOST_RUNS)
 
 
-def one_or_each(value: ArrayLike) -> tuple[int, ...]:
+def parameter_shape(value: ArrayLike) -> tuple[int, ...]:
     """Return the shape of a parameter: () for one number, (l,) for one per sensor."""
     values = np.asarray(value)
     return values.shape if values.ndim == 1 else ()
@@ -279,14 +279,14 @@ def adaptive_thresholds(rho_bar: ArrayLike, rho_initial: ArrayLike, adaptation: 
     Raises:
         ConfigurationError: A number is outside its limits.
     """
-    limit = not_negative("rho_bar", rho_bar, one_or_each(rho_bar))
+    limit = not_negative("rho_bar", rho_bar, parameter_shape(rho_bar))
     if np.any(limit > 1.0):
         raise refusal("rho_bar", rho_bar, ">= 0 and <= 1")
-    initial = not_negative("rho_initial", rho_initial, one_or_each(rho_initial))
+    initial = not_negative("rho_initial", rho_initial, parameter_shape(rho_initial))
     if initial.ndim == limit.ndim == 1 and len(initial) != len(limit):
         raise refusal(
             "rho_initial", rho_initial, f"a number, or as many as rho_bar = {display(rho_bar)} has"
         )
     if np.any(initial > limit):
         raise refusal("rho_initial", rho_initial, f"<= rho_bar = {display(rho_bar)}")
-    positive("adaptation", adaptation, one_or_each(adaptation))
+    positive("adaptation", adaptation, parameter_shape(adaptation))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from agents.workers import Call, Pool, side_by_side
+from agents.workers import Call, Pool, run_parallel
 from fusion_gym.validation import ConfigurationError
 
 
@@ -20,4 +20,4 @@ def test_a_pool_that_is_not_there_is_refused() -> None:
 @pytest.mark.parametrize("backend", ["loky", "dask"])
 def test_a_pool_returns_results_in_their_order(backend: str) -> None:
     calls = [Call(1.0, pow, (2, exponent)) for exponent in range(6)]
-    assert side_by_side(calls, Pool(2, backend), "powers") == [1, 2, 4, 8, 16, 32]  # type: ignore[arg-type]
+    assert run_parallel(calls, Pool(2, backend), "powers") == [1, 2, 4, 8, 16, 32]  # type: ignore[arg-type]

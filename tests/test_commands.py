@@ -45,7 +45,7 @@ def test_help_shows_every_option(
     assert "{None}" not in text
     kind = load(name)
     options = {field.name: field for field in dataclasses.fields(kind)}
-    for own, option in (("options", "set"), ("of", "class")):
+    for own, option in (("options", "set"), ("class_name", "class")):
         if own in options:
             options[option] = options.pop(own)
     listed = text.partition("--help")[2]  # the usage above it may name options as well
@@ -61,7 +61,7 @@ def test_lists_and_flags_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     words = "--settings a b --quick --class local --policy always --work deep/er"
     monkeypatch.setattr(sys, "argv", ["program", *words.split()])
     command = command_line.read_command(Benchmark)
-    assert (command.settings, command.of, command.policy) == (("a", "b"), "local", "always")
+    assert (command.settings, command.class_name, command.policy) == (("a", "b"), "local", "always")
     assert (command.quick, command.work) == (True, Path("deep/er"))
     assert (command.results, command.workers) == (None, 2)
 
@@ -122,7 +122,7 @@ def test_a_page_speaks_of_the_defaults_of_its_environment(env_id: str) -> None:
     page = catalogue()["environments"][env_id].page()
     options = options_of(env_id)()
     assert ("sensors share limited tokens in turns" in page) == (options.sharing == "turns")
-    assert ("0 requests nobody" in page) == (options.access == "single")
+    assert ("0 is no request, m requests" in page) == (options.access == "single")
 
 
 FORMULAS = {

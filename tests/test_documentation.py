@@ -74,7 +74,7 @@ def test_the_readme_says_what_the_results_say() -> None:
 def doc_of(env_id: str) -> str:
     """The page that docs/environments.md links for an environment."""
     text = (ROOT / "docs/environments.md").read_text()
-    row = re.search(rf"\[`{env_id}`\]\((\w+\.md)\)", text)
+    row = re.search(rf"\[`{env_id.split('/')[1]}`\]\((\w+\.md)\)", text)
     assert row is not None
     return (ROOT / "docs" / row[1]).read_text()
 

@@ -29,7 +29,7 @@ def markov(**options: Any) -> Task:
 
 @pytest.fixture(autouse=True)
 def _forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(periodic_optimum, "_found", {})
+    monkeypatch.setattr(periodic_optimum, "_cache", {})
 
 
 @pytest.mark.parametrize(("packets", "best"), [(2, 2.333), (4, 1.727)])
@@ -115,7 +115,7 @@ def test_a_file_holds_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
     first: Any = make_policy(text, markov())
     assert [entry.name for entry in path.parent.iterdir()] == ["schedules.json"]
     PeriodicOptimum(markov(), 1, 3, str(path))  # beside the first
-    monkeypatch.setattr(periodic_optimum, "_found", {})
+    monkeypatch.setattr(periodic_optimum, "_cache", {})
     monkeypatch.setattr(periodic_optimum, "_search", None)
     before = path.read_bytes()
     again: Any = make_policy(text, markov())
@@ -152,7 +152,7 @@ def test_an_entry_that_cannot_be_true_is_reproduced(
     saved = json.loads(path.read_text())
     (key,) = saved["periodic_optimum"]
     path.write_text(json.dumps({"periodic_optimum": {key: entry, "another": 1}}))
-    monkeypatch.setattr(periodic_optimum, "_found", {})
+    monkeypatch.setattr(periodic_optimum, "_cache", {})
     result = PeriodicOptimum(markov(), 1, 2, str(path))
     np.testing.assert_array_equal(result.schedule, right.schedule)
     assert result.trace == right.trace

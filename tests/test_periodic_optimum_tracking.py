@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @pytest.fixture(autouse=True)
 def _forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(periodic_optimum, "_found", {})
+    monkeypatch.setattr(periodic_optimum, "_cache", {})
 
 
 def correlated(**options: Any) -> Task:

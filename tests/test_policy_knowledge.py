@@ -125,7 +125,7 @@ def believes(name: str) -> bool:
     """Whether a policy looks at what is believed, and is tried where that differs."""
     maker = policy_maker(name)
     believing = isinstance(maker, type) and issubclass(maker, BeliefRule)
-    return believing or hasattr(maker, "remember") or name == "zoo"
+    return believing or hasattr(maker, "memory_owner") or name == "zoo"
 
 
 def tried(name: str) -> list[tuple[str, Knowledge, set[str]]]:
@@ -169,9 +169,9 @@ class Liar(Rule):
         self,
         knowledge: Knowledge,
         number: Callable[[Signals], Any],
-        remember: Owner | None = None,
+        memory_owner: Owner | None = None,
     ) -> None:
-        self.declared, self.number, self.remember = knowledge, number, remember
+        self.declared, self.number, self.memory_owner = knowledge, number, memory_owner
 
     @property
     def knowledge(self) -> Knowledge:
@@ -248,7 +248,7 @@ def test_a_policy_that_lies_is_caught(name: str) -> None:
     liar, what = LIARS[name]
     register_policy(name, lambda: copy.deepcopy(liar))
     task = task_of("remote, losses" if name == "knows_losses" else "tobit")
-    if liar.remember is not None:
+    if liar.memory_owner is not None:
         task = task_of("tobit, memory")
     assert what not in may_matter(liar.knowledge)
     if name in REFUSED:

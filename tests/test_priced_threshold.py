@@ -183,7 +183,7 @@ def test_who_knows_its_scores() -> None:
     ):
         policy: Any = make_policy(f"priced_threshold:{settings}", task_of(memory=memory))
         assert policy.knowledge == knowledge
-        assert (policy.remember is None) == ("score=value" not in settings and not policy.own)
+        assert (policy.memory_owner is None) == ("score=value" not in settings and not policy.own)
     make_policy("priced_threshold:score=variance", centre)
     for score in ("value", "innovation"):
         with pytest.raises(ConfigurationError, match="information = 'centre'"):

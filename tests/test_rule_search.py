@@ -10,8 +10,8 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.beside import run_beside, run_priced
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.policy_batch import run_policies, run_priced
 from fusion_gym.evaluation.rule_search import (
     Generation,
     RuleSearch,
@@ -45,7 +45,7 @@ def test_costs_beside_each_other_are_those_of_episodes() -> None:
     seeds = np.tile(np.arange(5, 11), 3)
     prices = np.repeat(PRICES, 6)
     priced = run_priced(task, make_policy(text, task), seeds, prices)
-    briefs = run_beside(task, [make_policy(rule, task) for rule in rules], 6, 5)
+    briefs = run_policies(task, [make_policy(rule, task) for rule in rules], 6, 5)
     for place, (rule, price, brief) in enumerate(zip(rules, PRICES, briefs, strict=True)):
         single = run_episodes(task, make_policy(rule, task), 6, 5)
         np.testing.assert_array_equal(brief.error_cost, single.error_cost)
@@ -131,7 +131,7 @@ def test_the_start_fits_the_margin_to_the_prices() -> None:
     assert point["margin"] == pytest.approx(2.0 / 3.0 * np.log(20.0))
     rule: Any = make_policy("priced_threshold:margin=4,margin_exponent=1,price=0.1", task_of())
     same: Any = make_policy("priced_threshold:margin=1,price=0.1", task_of())  # 4 · 0.1 is below 1
-    results = [run_beside(task_of(), [policy], 4, 0)[0] for policy in (rule, same)]
+    results = [run_policies(task_of(), [policy], 4, 0)[0] for policy in (rule, same)]
     np.testing.assert_array_equal(results[0].tokens, results[1].tokens)
 
 

@@ -57,9 +57,9 @@ KINDS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("runs", [1, 6])
 def test_all_at_once_is_bitwise_one_after_another(name: str, runs: int) -> None:
     task = task_of(**KINDS[name])
-    assert task.system.offers("fused_alone")
+    assert task.system.offers("single_deliveries")
     expected = one_by_one(task, sensed(task, runs))
-    result = task.system.fused_alone(sensed(task, runs))
+    result = task.system.single_deliveries(sensed(task, runs))
     np.testing.assert_array_equal(result[0], expected[0])
     np.testing.assert_array_equal(result[1], expected[1])
     assert len(np.unique(result[0][:, 0, 0])) == MANY
@@ -69,7 +69,7 @@ def test_the_joint_filter_agrees_up_to_rounding() -> None:
     correlated = np.eye(2 * MANY) + 0.3
     task = task_of(filter="joint", joint_measurement_covariance=correlated.tolist())
     state = sensed(task, 6)
-    expected, result = one_by_one(task, state), task.system.fused_alone(state)
+    expected, result = one_by_one(task, state), task.system.single_deliveries(state)
     np.testing.assert_allclose(result[0], expected[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(result[1], expected[1], rtol=1e-9, atol=1e-12)
 

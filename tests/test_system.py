@@ -17,9 +17,9 @@ from fusion_gym.validation import ConfigurationError
 IMAGINED = {"imagine", "imagination_channels"}
 OFFERED: list[tuple[str, dict[str, Any], set[str]]] = [
     ("TobitOscillator", {}, {"adopt"}),
-    ("TobitOscillator", {"filter": "tobit"}, {"adopt", "fused_alone"}),
+    ("TobitOscillator", {"filter": "tobit"}, {"adopt", "single_deliveries"}),
     ("TobitOscillator", {"filter": "adf"}, {"adopt"}),
-    ("LinearFusion", {}, {"adopt", "covariance_cycle", "fused_alone"}),
+    ("LinearFusion", {}, {"adopt", "covariance_cycle", "single_deliveries"}),
     ("MarkovJumpTracking", {}, {"covariance_cycle"}),
     ("MarkovJumpTracking", {"filter": "imm"}, set()),
     ("UnknownInput", {"filter": "predict"}, {"covariance_cycle"}),

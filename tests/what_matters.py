@@ -42,7 +42,7 @@ class Believed:
         self.values, self.made_of = values, made_of
 
     @classmethod
-    def of(cls, beliefs: Any, steps: int) -> Believed:
+    def from_beliefs(cls, beliefs: Any, steps: int) -> Believed:
         """All that a policy may ask of beliefs, over so many steps."""
         values = {name: getattr(beliefs, name) for name in cls.parts}
         made_of = {
@@ -82,7 +82,10 @@ def read(signals: Signals, policy: Any) -> Values:
     beliefs = ("beliefs", "own_beliefs", *(signal.name for signal in MEMORY_SIGNALS))
     believes, steps = owner_of(policy) is not None, getattr(policy, "steps", 1)
     result: Values = {name: signals[name] for name in signals if believes or name not in beliefs}
-    return {n: Believed.of(v, steps) if isinstance(v, Beliefs) else v for n, v in result.items()}
+    return {
+        n: Believed.from_beliefs(v, steps) if isinstance(v, Beliefs) else v
+        for n, v in result.items()
+    }
 
 
 def with_states(batch: EpisodeBatch, state: Any, memory: Memory) -> EpisodeBatch:

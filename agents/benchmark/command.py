@@ -33,7 +33,7 @@ from agents.workers import BackendName, Pool
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.options import OutputFolder, Whole, writable_folder
 from fusion_gym.output.ending import ended_like_by_ctrl_c
-from fusion_gym.output.folders import alone_in
+from fusion_gym.output.folders import lock_folder
 from fusion_gym.output.progress import writing
 from fusion_gym.validation import refusal
 
@@ -79,7 +79,7 @@ class Benchmark(Long):
         work = self.work / ("quick" if self.quick else "full")
         folder = self.results or (work / "results" if self.quick else Path("results"))
         writable_folder("results", folder)
-        with ended_like_by_ctrl_c(), alone_in(work, "work"):
+        with ended_like_by_ctrl_c(), lock_folder(work, "work"):
             runner = Runner(work.absolute(), pool)
             writing(("finished pieces of work", work))
             if self.second_search or self.policy is not None:

@@ -42,7 +42,7 @@ REFERENCE = "rule"
 
 
 @dataclass
-class ClassEvidence:
+class ClassRecord:
     """The results of a class of a setting, by kind of policy and training seed."""
 
     setting: Setting
@@ -100,7 +100,7 @@ class ClassEvidence:
         return min(scores, key=scores.__getitem__)
 
 
-def gather(suite: Suite, runner: Runner) -> list[ClassEvidence]:
+def gather(suite: Suite, runner: Runner) -> list[ClassRecord]:
     """Run unfinished work, and return all classes."""
     classes = find_prices(suite, runner)
     find_rules(suite, runner, classes)
@@ -115,7 +115,7 @@ def gather(suite: Suite, runner: Runner) -> list[ClassEvidence]:
 
 def find_prices(
     suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASSES
-) -> list[ClassEvidence]:
+) -> list[ClassRecord]:
     """Tune the rules with one threshold, and freeze the prices of the classes."""
 
     def sweep(
@@ -127,7 +127,7 @@ def find_prices(
     places = [(setting, name) for setting in suite.settings for name in names]
     jobs = [sweep(setting, name, setting.has_memory(name)) for setting, name in places]
     results = runner.run(run_sweep, jobs, "single thresholds")
-    classes = [ClassEvidence(*place, result) for place, result in zip(places, results, strict=True)]
+    classes = [ClassRecord(*place, result) for place, result in zip(places, results, strict=True)]
     others = [entry for entry in classes if entry.setting.has_memory(entry.name)]
     jobs = [sweep(entry.setting, entry.name, False, entry.prices) for entry in others]
     results = runner.run(run_sweep, jobs, "single thresholds without memory")
@@ -136,7 +136,7 @@ def find_prices(
     return classes
 
 
-def find_rules(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
+def find_rules(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
     """Search one rule for all prices of each class."""
     jobs = [
         SearchJob(
@@ -148,7 +148,7 @@ def find_rules(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -
         entry.rule = f"{text},price={{price}}"
 
 
-def train_agents(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
+def train_agents(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
     """Train one agent per class and seed."""
     places = [(entry, seed) for entry in classes for seed in range(suite.training_seeds)]
     jobs = []
@@ -161,9 +161,9 @@ def train_agents(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence])
         entry.models.append(job.model)
 
 
-def test_all(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
+def test_all(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
     """Test every kind of policy on the test episodes, and rules and agents in validation."""
-    places: list[tuple[ClassEvidence, str, bool]] = []
+    places: list[tuple[ClassRecord, str, bool]] = []
     jobs: list[TestJob] = []
     for entry in classes:
         for kind, policies in policies_of(entry):
@@ -179,7 +179,7 @@ def test_all(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> 
         tests.setdefault(kind, []).append(outcomes)
 
 
-def policies_of(entry: ClassEvidence) -> Iterator[tuple[str, list[str]]]:
+def policies_of(entry: ClassRecord) -> Iterator[tuple[str, list[str]]]:
     """Yield the kinds of policy of a class, each with one policy per price."""
     count = len(entry.prices)
     yield REFERENCE, [entry.rule] * count
@@ -193,9 +193,9 @@ def policies_of(entry: ClassEvidence) -> Iterator[tuple[str, list[str]]]:
         yield "agent", [f"model:{model},price={{price}}"] * count
 
 
-def test_cases(suite: Suite, runner: Runner, classes: Sequence[ClassEvidence]) -> None:
+def test_cases(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
     """Test the rule, and the agent with the least validation cost, in every perturbed case."""
-    places: list[tuple[ClassEvidence, str]] = []
+    places: list[tuple[ClassRecord, str]] = []
     jobs: list[TestJob] = []
     for entry in classes:
         agent = f"model:{entry.models[entry.best_agent]},price={{price}}"
@@ -224,9 +224,7 @@ def check_policy(suite: Suite, text: str, name: ClassName) -> None:
             )
 
 
-def evaluate_policy(
-    suite: Suite, runner: Runner, text: str, name: ClassName
-) -> list[ClassEvidence]:
+def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) -> list[ClassRecord]:
     """Test a policy in a class of every setting, together with the searched rule."""
     classes = find_prices(suite, runner, (name,))
     find_rules(suite, runner, classes)
@@ -235,7 +233,7 @@ def evaluate_policy(
     return classes
 
 
-def search_again(suite: Suite, runner: Runner) -> list[ClassEvidence]:
+def search_again(suite: Suite, runner: Runner) -> list[ClassRecord]:
     """Search three random classes with four times the generations and other episodes."""
     classes = find_prices(suite, runner)
     find_rules(suite, runner, classes)
@@ -256,7 +254,7 @@ def search_again(suite: Suite, runner: Runner) -> list[ClassEvidence]:
 
 
 def test_texts(
-    suite: Suite, runner: Runner, classes: Sequence[ClassEvidence], kinds: dict[str, list[str]]
+    suite: Suite, runner: Runner, classes: Sequence[ClassRecord], kinds: dict[str, list[str]]
 ) -> None:
     """Test one policy of every kind for each class, at all prices."""
     for kind, texts in kinds.items():
@@ -268,7 +266,7 @@ def test_texts(
             entry.tests[kind] = [outcomes]
 
 
-def policy_rows(suite: Suite, classes: Sequence[ClassEvidence]) -> list[TestRow]:
+def policy_rows(suite: Suite, classes: Sequence[ClassRecord]) -> list[TestRow]:
     """Return a row for every policy at every price."""
     return [
         TestRow(
@@ -283,9 +281,9 @@ def policy_rows(suite: Suite, classes: Sequence[ClassEvidence]) -> list[TestRow]
     ]  # fmt: skip
 
 
-def point_rows(suite: Suite, classes: Sequence[ClassEvidence]) -> list[PointRow]:
+def point_rows(suite: Suite, classes: Sequence[ClassRecord]) -> list[PointRow]:
     """Return the difference to the searched rule at every price."""
-    places: list[tuple[ClassEvidence, str, float, float]] = []
+    places: list[tuple[ClassRecord, str, float, float]] = []
     results: list[Difference] = []
     for entry in classes:
         reference = entry.tests[REFERENCE][0]
@@ -303,7 +301,7 @@ def point_rows(suite: Suite, classes: Sequence[ClassEvidence]) -> list[PointRow]
     ]
 
 
-def class_rows(classes: Sequence[ClassEvidence]) -> list[ClassRow]:
+def class_rows(classes: Sequence[ClassRecord]) -> list[ClassRow]:
     """Return the mean difference to the searched rule over a class's prices.
 
     The proven bound is a kind of its own, without an interval.
@@ -323,7 +321,7 @@ def class_rows(classes: Sequence[ClassEvidence]) -> list[ClassRow]:
     return rows
 
 
-def choice_rows(classes: Sequence[ClassEvidence]) -> list[ChoiceRow]:
+def choice_rows(classes: Sequence[ClassRecord]) -> list[ChoiceRow]:
     """Return the policy of each class with the least validation cost, and the effect of memory."""
     rows = []
     for entry in classes:
@@ -344,7 +342,7 @@ def choice_rows(classes: Sequence[ClassEvidence]) -> list[ChoiceRow]:
     return rows
 
 
-def case_rows(classes: Sequence[ClassEvidence]) -> list[CaseRow]:
+def case_rows(classes: Sequence[ClassRecord]) -> list[CaseRow]:
     """Return the costs of every scheduler's rule and agent in the perturbed cases."""
     rows = []
     for entry in classes:

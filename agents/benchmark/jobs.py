@@ -11,7 +11,7 @@ import pydantic
 
 from agents.benchmark.settings import Setting
 from agents.cache import Cache
-from agents.workers import Pool, missing, side_by_side
+from agents.workers import Pool, missing, run_parallel
 from fusion_gym.evaluation.rule_search import ClassName
 
 AnyJob = TypeVar("AnyJob", bound="Job")
@@ -56,5 +56,5 @@ class Runner:
         self, work: Callable[[AnyJob], Result], jobs: Sequence[AnyJob], title: str
     ) -> list[Result]:
         """Return the results of jobs in their order, from the folder or computed."""
-        side_by_side(missing(work, jobs, self.cache), self.pool, title)
+        run_parallel(missing(work, jobs, self.cache), self.pool, title)
         return [self.cache.read(work, job.inputs) for job in jobs]

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from rich.table import Table
 
 from agents.benchmark.evidence import (
-    ClassEvidence,
+    ClassRecord,
     case_rows,
     choice_rows,
     class_rows,
@@ -47,7 +47,7 @@ LINES = {  # kind: label, colour, marker
 }
 
 
-def write_results(suite: Suite, classes: Sequence[ClassEvidence], folder: Path) -> None:
+def write_results(suite: Suite, classes: Sequence[ClassRecord], folder: Path) -> None:
     """Write all tables, a figure per setting, the page, and README's table."""
     folder.mkdir(parents=True, exist_ok=True)
     policies, points = policy_rows(suite, classes), point_rows(suite, classes)
@@ -134,8 +134,8 @@ def class_table(
     for row in choices:
         cells = [by_kind.get((row.setting, row.name, kind), "–") for kind in kinds]
         memory = "–" if np.isnan(row.memory) else f"{row.memory:+.1%}".replace("-", "−")
-        chosen = f"{row.choice} {relative_text(row)}" if row.choice != "rule" else "rule"
-        lines.append((titles[row.setting], TITLES[row.name], *cells, chosen, memory))
+        best = f"{row.choice} {relative_text(row)}" if row.choice != "rule" else "rule"
+        lines.append((titles[row.setting], TITLES[row.name], *cells, best, memory))
     heads = (LINES[kind][0] for kind in kinds)
     return table(("setting", "class", *heads, "validation chooses", "without memory"), lines)
 
@@ -188,7 +188,7 @@ def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
     save_figure(figure, path)
 
 
-def draw_headline(rows: Sequence[TestRow], entry: ClassEvidence, path: Path) -> None:
+def draw_headline(rows: Sequence[TestRow], entry: ClassRecord, path: Path) -> None:
     """Draw one class and its proven bound: error >= max over prices of (bound - price · tokens)."""
     plt.rcParams.update(READABLE)
     figure, panel = plt.subplots(figsize=(7.0, 4.4))

@@ -17,7 +17,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.scale import prices_at
 from fusion_gym.core.system import covers
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.beside import run_beside
+from fusion_gym.evaluation.policy_batch import run_policies
 from fusion_gym.evaluation.rule_search import (
     Generation,
     ThresholdTrial,
@@ -123,7 +123,7 @@ def _try(task: Task, rule: ThresholdRule, values: Array, episodes: int) -> list[
 def _prices(task: Task, trials: Sequence[ThresholdTrial], job: SweepJob) -> tuple[float, ...]:
     """Return the prices at which the best of all trials spends the shares of ``always``."""
     always = make_policy("always", task)
-    most = float(run_beside(task, [always], job.episodes[0], TUNING_SEED)[0].tokens.mean())
+    most = float(run_policies(task, [always], job.episodes[0], TUNING_SEED)[0].tokens.mean())
     tokens, error = np.array([(trial.tokens, trial.error) for trial in trials]).T
     prices = prices_at(tokens, error, np.array(job.shares) * most)
     for place in range(1, len(prices)):

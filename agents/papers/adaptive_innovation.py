@@ -16,9 +16,9 @@ from agents.papers.adaptive_innovation_runs import (
     ELLIPSES,
     SENSORS,
     STEPS,
-    Ask,
     ErrorRecord,
     Lane,
+    RequestFunction,
     steps,
     top,
 )
@@ -97,19 +97,19 @@ def _against_the_centre(signals: Signals) -> Array:
 def _readings() -> dict[str, Lane]:
     return {
         OURS: Lane(),
-        PRINTED_SIGN: Lane(ask=_Reading(_printed)),
+        PRINTED_SIGN: Lane(rule=_Reading(_printed)),
         "the threshold after this very step's innovation, l(k) = k": Lane(
-            ask=_Reading(lambda last, now: _ours(now, now))
+            rule=_Reading(lambda last, now: _ours(now, now))
         ),
         "|ε|² instead of |ε| in the exponent": Lane(
-            ask=_Reading(lambda last, now: _ours(last**2, now))
+            rule=_Reading(lambda last, now: _ours(last**2, now))
         ),
-        "|ε| instead of |ε|² against the threshold": Lane(ask=_Reading(_ours, power=1)),
-        "ε against the fused prediction (SICI)": Lane(ask=_Reading(_ours, _against_the_centre)),
+        "|ε| instead of |ε|² against the threshold": Lane(rule=_Reading(_ours, power=1)),
+        "ε against the fused prediction (SICI)": Lane(rule=_Reading(_ours, _against_the_centre)),
         "x(0) exactly at its mean": Lane(known_start=True),
         "actual variances 0.8 of the bounds": Lane(scale=0.8),
-        FIXED: Lane(ask=_Reading(lambda last, now: _ours(0.0 * last, now))),
-        TIMED: Lane(ask=_Reading(lambda last, now: 0.0 * last)),
+        FIXED: Lane(rule=_Reading(lambda last, now: _ours(0.0 * last, now))),
+        TIMED: Lane(rule=_Reading(lambda last, now: 0.0 * last)),
     }
 
 
@@ -188,17 +188,17 @@ def _summarise_rates(data: Data) -> Data:
 # --- errors, actual and conservative variances ----------------------------------------------------
 
 
-def _of_other_episodes(episodes: int) -> Ask:
+def _of_other_episodes(episodes: int) -> RequestFunction:
     """Return the trigger's requests in the next episode of the first lane.
 
     They have the same rates and patterns, and are independent of the episode's own noise.
     """
 
-    def ask(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def request(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
         others = np.roll(event[:, :episodes], -1, axis=1)
         return np.tile(others, event.shape[1] // episodes)
 
-    return ask
+    return request
 
 
 def _always(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -220,7 +220,7 @@ def simulate_fusion(
     scaled = {f"scale {scale}": Lane(scale) for scale in settings["scales"]}
     groups = {
         "bounds": {AT_BOUND: Lane()}, "scales": scaled, "first": dict([next(iter(scaled.items()))]),
-        "others": {OTHERS: Lane(ask=_of_other_episodes(episodes)), ALWAYS: Lane(ask=_always)},
+        "others": {OTHERS: Lane(rule=_of_other_episodes(episodes)), ALWAYS: Lane(rule=_always)},
     }  # fmt: skip
     selected = {name: lane for group in lanes for name, lane in groups[group].items()}
     data: Data = {"lanes": list(selected), "scales": list(settings["scales"])}

@@ -25,17 +25,17 @@ _EVERY = 5  # steps from one comparison of the nodes' matrices to the next
 _ROUNDING = 1e-8  # of a generalised eigenvalue: without noise below the bounds it is 1
 
 # Signals and the trigger's requests (sensors, N) to the requests of the same runs.
-Ask = Callable[[Signals, NDArray[np.bool_]], NDArray[np.bool_]]
+RequestFunction = Callable[[Signals, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
 class Lane(NamedTuple):
     """A setting of every episode: actual over bound variances, and the requests.
 
-    ``ask`` replaces the trigger's requests; ``known_start`` sets x(0) to its mean.
+    ``rule`` replaces the trigger's requests; ``known_start`` sets x(0) to its mean.
     """
 
     scale: float = 1.0
-    ask: Ask | None = None
+    rule: RequestFunction | None = None
     known_start: bool = False
 
 
@@ -88,9 +88,9 @@ def steps(
         event = trigger(signals)
         requests = event.copy()
         for place, lane in enumerate(lanes):
-            if lane.ask is not None:
+            if lane.rule is not None:
                 own = slice(place * episodes, (place + 1) * episodes)
-                requests[:, own] = lane.ask(signals, event)[:, own]
+                requests[:, own] = lane.rule(signals, event)[:, own]
         outcome = batch.step(requests)
         yield Step(number, batch.delivered, outcome, innovation)
 

@@ -96,7 +96,7 @@ class Run(NamedTuple):
 
 
 def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
-    """Run episodes with the seeds ``seed``, ``seed + 1``, …"""
+    """Run episodes with consecutive seeds from ``seed``."""
     rows: list[tuple[Any, ...]] = []
     for batch, requests in walk(task, policy, episodes, seed):
         outcome, state = batch.step(requests), batch.delivered
@@ -237,13 +237,13 @@ def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
             }
         sigma = covariances(system, run.sent, swapped=True)
         least.append(float(np.linalg.eigvalsh((sigma + np.swapaxes(sigma, 1, 2)) / 2.0).min()))
-    beside = run_markov_jump(example(fusion="ci"), trigger(0.0), episodes, seed)
+    references = run_markov_jump(example(fusion="ci"), trigger(0.0), episodes, seed)
     _, squares = system.model.state_moments(task.horizon)
     return first | {
         "m": list(settings["m"]),
         "claimed": system.recursion.local_trace[:, system.filters.at(time)].mean(-1),
         "fused": np.array(fused), "traces": traces, "least": least,
-        "moment_claimed": float(squares[1:].sum(1).mean()), "ci": beside.squared.sum(1).mean(0),
+        "moment_claimed": float(squares[1:].sum(1).mean()), "ci": references.squared.sum(1).mean(0),
     }  # fmt: skip
 
 
@@ -312,7 +312,7 @@ def _summarise_others(data: Data) -> Data:
         {"m": m[i], "packets": data["packets"][i], "paper": paper[i], "best": best}
         for i, best in zip(searched, data["best"], strict=True)
     ]
-    beside = {
+    references = {
         "the paper's scheme, all sent (m = 0)": [data["sent"]],
         "one linear filter for all measurements": [data["centralised"]],
         "interacting multiple models, all measurements": [data["modes"]],
@@ -325,7 +325,7 @@ def _summarise_others(data: Data) -> Data:
         "columns": columns,
         "tables": {
             "rates": grid(columns, {f"m = {level:g}": pair for level, pair in rows}),
-            "beside": grid(("squared error",), beside),
+            "beside": grid(("squared error",), references),
         },
         "shares": np.mean(data["rates"], axis=1), "period": _PERIOD, "schedules": schedules,
         "far": below(1.1 * data["best"], paper[searched]),

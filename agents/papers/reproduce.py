@@ -34,11 +34,11 @@ from agents.papers.paper import (
     load_paper,
     load_papers,
 )
-from agents.workers import Call, Pool, side_by_side
+from agents.workers import Call, Pool, run_parallel
 from fusion_gym.commands.command_line import Command, SetOptions
 from fusion_gym.commands.options import OutputFolder, Seed, Whole
 from fusion_gym.output.ending import ended_like_by_ctrl_c
-from fusion_gym.output.folders import alone_in
+from fusion_gym.output.folders import lock_folder
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, integer
 
@@ -90,7 +90,7 @@ class Reproduce(Command):
             self._reproduce_pages(papers, self.output or Path("docs/reproduction"))
 
     def _reproduce_pages(self, papers: list[Paper], output: Path) -> None:
-        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+        with ended_like_by_ctrl_c(), lock_folder(self.work, "work"):
             print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
             jobs = {
                 (paper.name, piece.name): self._job(piece, paper.settings({}))
@@ -110,7 +110,7 @@ class Reproduce(Command):
         name, figure = paper.figure(name)
         settings = paper.settings(changes, figure.without)
         path = (self.output or Path("runs/figures")) / paper.name / name
-        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+        with ended_like_by_ctrl_c(), lock_folder(self.work, "work"):
             job = self._job(paper.piece(figure.piece), settings, figure.restriction)
             write_figure(figure, self._simulate([job])[0], path)
         print(f"{paper.name}: {path}.png")
@@ -126,7 +126,7 @@ class Reproduce(Command):
                 cache.drop(*job.key)
         absent = [job for job in jobs if not cache.holds(*job.key)]
         work = [Call(job.weight, job.simulate, (cache,)) for job in absent]
-        side_by_side(work, Pool(self.workers), "reproducing")
+        run_parallel(work, Pool(self.workers), "reproducing")
         return [cache.read(*job.key) for job in jobs]
 
     def interrupted(self) -> str:

@@ -151,7 +151,7 @@ def simulate_nodes(episodes: int, seed: int, settings: Settings) -> Data:
 
 def _summarise_nodes(data: Data) -> Data:
     names = {
-        "fused": "FTKF-DB", **{f"single_{i}": f"LTKF-DB-S{i + 1} by itself" for i in range(2)},
+        "fused": "FTKF-DB", **{f"single_{i}": f"LTKF-DB-S{i + 1}, single" for i in range(2)},
         **{f"node_{i}": f"LTKF-DB-S{i + 1} as a node" for i in range(2)},
     }  # fmt: skip
     columns = [f"ARMSE{state + 1}" for state in range(3)]
@@ -262,13 +262,15 @@ def _summarise_tables(data: Data) -> Data:
         *(f"ARMSE{i + 1}" for i in range(3)),
         *(f"median run, {_FILTERS[name]}" for name in ("adf", "paper")),
     )
-    beside = []
+    references = []
     for label, row in others.items():
-        beside += [runs.armse_number(f"{label}: {heads[i]}", row["adf"], i, None) for i in range(3)]
+        references += [
+            runs.armse_number(f"{label}: {heads[i]}", row["adf"], i, None) for i in range(3)
+        ]
         for name, head in zip(("adf", "paper"), heads[3:], strict=True):
-            beside.append(Number(f"{label}: {head}", *row[name]["median"]))
+            references.append(Number(f"{label}: {head}", *row[name]["median"]))
     return {
-        "tables": numbers | {"others": beside}, "heads": heads,
+        "tables": numbers | {"others": references}, "heads": heads,
         "printed_rows": list(zip(variance_names, TABLE_III.values(), third, strict=True)),
         **_broken(data, printed), "narrow": _moves(second, "low", 1.0),
         "noise": _moves(third, "high", -1.0),

@@ -239,7 +239,7 @@ def failures(
 
     for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
         covariance = batch.state.prior_covariance
-        observed = [_seen(task, batch, sensor) for sensor in range(task.sensors)]
+        observed = [_prediction(task, batch, sensor) for sensor in range(task.sensors)]
         for place, bound in enumerate(bounds):
             own = covariance * bound.inflation
             if step == 0:
@@ -256,7 +256,7 @@ def failures(
     return local / (task.horizon - 1), fused / (task.horizon - 1)
 
 
-def _of(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]:
+def _bounds(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]:
     """Return both bounds of a sensor in all their readings."""
     return {
         f"{end}/{name}": MatrixBound(task, sensor, inflation, end == "upper", reading)
@@ -265,7 +265,7 @@ def _of(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]:
     }
 
 
-def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
+def _prediction(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
     sensors, expected = censored(task).centre.sensors, batch.state.prediction.expectation
     limit, deviation = sensors.threshold[sensor, 0], sensors.deviation[sensor, 0]
     low = (limit - expected.latent[sensor, 0]) / deviation
@@ -295,12 +295,12 @@ def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
     for example, (env, options) in EXAMPLES.items():
         task = fusion_gym.make_task(env, **options)
         for sensor in range(2):
-            single = _of(task, sensor, 1.0)
+            single = _bounds(task, sensor, 1.0)
             policy = SomeSensors(fusion_gym.make_policy("periodic:period=2", task), {sensor})
             local, _ = failures(task, policy, episodes, seed, list(single.values()))
             for name, sample in zip(single, local, strict=True):
                 data[f"{example}:4/{name}/{sensor}"] = sample
-        nodes = [_of(task, sensor, 1.0 / SHARE) for sensor in range(2)]
+        nodes = [_bounds(task, sensor, 1.0 / SHARE) for sensor in range(2)]
         bounds = [node[name] for name in nodes[0] for node in nodes]
         _, fused = failures(task, "round_robin", episodes, seed, bounds)
         for name, sample in zip(nodes[0], fused, strict=True):

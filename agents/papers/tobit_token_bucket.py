@@ -107,17 +107,17 @@ def simulate_estimates(
     local = np.abs(np.diff(result.truth[:, None] - result.local_mean, axis=0))
     fused = np.abs(np.diff(result.truth - result.mean, axis=0))
     censored = (result.measurement <= 0.0)[1:]
-    beside = [record_history(runs.single_sensor(m), episodes, seed) for m in singles]
+    nodes = [record_history(runs.single_sensor(m), episodes, seed) for m in singles]
     return {
         "truth": result.truth[..., 0], "local": result.local_mean[..., 0],
         "fused": result.mean[..., 0], "local_change": local.mean(0), "fused_change": fused.mean(0),
         "change_censored": _mean_where(local[:, 2, 1], censored[:, 2, 1]),
         "change_uncensored": _mean_where(local[:, 2, 1], ~censored[:, 2, 1]),
         "mse": result.fused_error.mean(0),
-        "single_mse": np.array([item.fused_error.mean(0) for item in beside]),
+        "single_mse": np.array([item.fused_error.mean(0) for item in nodes]),
         "moved": np.abs(np.diff(result.mean, axis=0)).mean((0, 1)),
-        "single_moved": np.array([np.abs(np.diff(o.mean, axis=0)).mean((0, 1)) for o in beside]),
-        "single_rate": [float(item.granted.mean()) for item in beside],
+        "single_moved": np.array([np.abs(np.diff(o.mean, axis=0)).mean((0, 1)) for o in nodes]),
+        "single_rate": [float(item.granted.mean()) for item in nodes],
         "rate": float(result.granted.mean()),
     }  # fmt: skip
 
@@ -165,8 +165,8 @@ def _summarise_errors(data: Data) -> Data:
         "lg squared error": "lg_{}_error", "lg trace": "lg_{}_trace",
     }  # fmt: skip
     rows = {
-        who: [data[name.format("local")][m] for name in columns.values()]
-        for m, who in enumerate(_NODE_NAMES)
+        node: [data[name.format("local")][m] for name in columns.values()]
+        for m, node in enumerate(_NODE_NAMES)
     } | {"fused": [data[name.format("fused")] for name in columns.values()]}
     return {"columns": list(columns), "tables": {"errors": grid(tuple(columns), rows)}}
 
@@ -246,14 +246,14 @@ def _summarise_bucket_readings(data: Data) -> Data:
         name: (*local, own)
         for name, local, own in zip(data["readings"], data["local"], data["fused"], strict=True)
     }
-    beside = {
+    others = {
         "Kalman filters that ignore censoring, the paper's trigger and bucket": [data["ignoring"]],
         "the paper's filter, always sending, no bucket": [data["always"]],
     }
     not_below = ~below(data["fused"][:, None], data["local"])
     return {
         "columns": _WHO, "not_below": [(np.flatnonzero(row) + 1).tolist() for row in not_below],
-        "tables": {"readings": grid(_WHO, rows), "beside": grid(("fused",), beside)},
+        "tables": {"readings": grid(_WHO, rows), "beside": grid(("fused",), others)},
     }  # fmt: skip
 
 

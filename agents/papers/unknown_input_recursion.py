@@ -99,7 +99,7 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
 
     ``estimate`` (H, E, s), ``trace`` (H, E) of Ξ_x, ``least`` (H, E) the smallest eigenvalue of
     Ξ_x, ``hidden`` (H, E) the largest entry of ℬ - N C ℬ (14), and ``excess`` (H, E) the ratio of
-    the trace of (18) to that of the best gain.
+    the trace of (18) to the trace under the best gain.
     """
     episodes = held.shape[-1]
     mean = np.broadcast_to(model.mean, (episodes, len(model.mean)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from agents.benchmark.evidence import ClassEvidence, gather
+from agents.benchmark.evidence import ClassRecord, gather
 from agents.benchmark.jobs import Runner
 from agents.benchmark.settings import TEST_SEED, Suite, knowledge_of, load_suite
 from agents.workers import Pool
@@ -60,7 +60,7 @@ class Zoo(Long):
             print(f"zoo:{name} is removed")
 
 
-def agent_card(suite: Suite, entry: ClassEvidence, model: bytes) -> dict[str, Any]:
+def agent_card(suite: Suite, entry: ClassRecord, model: bytes) -> dict[str, Any]:
     """Return the content of an agent's JSON."""
     seed = entry.best_agent
     experiment = suite.experiment(entry.setting, entry.name, entry.prices, seed)

@@ -134,8 +134,8 @@ def compare(
     visible = dict.fromkeys([*sweep.points, *best, *(point.name for point in envelope), *learned])
     console = tables.console()
     title = f"{env_id}: single policies, the best of all {len(baselines)} baselines, and the agent"
-    shown = {name: report["policies"][name] for name in visible}
-    console.print(tables.evaluation_table(title, shown, report["quantiles"], {}))
+    reports = {name: report["policies"][name] for name in visible}
+    console.print(tables.evaluation_table(title, reports, report["quantiles"], {}))
     console.print(price_table(points, baselines))
     console.print(rate_table(points))
     warn_of_unused_tokens(task, next(iter(learned.values())))

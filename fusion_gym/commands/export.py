@@ -95,13 +95,13 @@ def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, 
             trained = zoo.card(name)["training"]["environment"]
             own = parse_settings("option", [word for words in command.options for word in words])
             return trained["id"], trained["options"] | own
-        beside = Path(name).parent / "config.yaml"
-        if not beside.is_file():
+        config_file = Path(name).parent / "config.yaml"
+        if not config_file.is_file():
             raise ConfigurationError(
                 f"env = None is not allowed with model = {command.model!r}, beside which lies no "
                 "config.yaml of its training: give --env ID or --config FILE"
             )
-        config = str(beside)
+        config = str(config_file)
     env_id, options, _ = environment_of(command.env, config, command.options)
     return env_id, options
 

@@ -35,7 +35,7 @@ from fusion_gym.evaluation.rule_search import (
 )
 from fusion_gym.output import tables
 from fusion_gym.output.files import read_json, write
-from fusion_gym.output.folders import alone_in, check_inputs
+from fusion_gym.output.folders import check_inputs, lock_folder
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.checked import checked
@@ -51,7 +51,7 @@ class Search(EnvironmentOptions, Long):
 
     output: Annotated[Path, OutputFolder()]
     """Folder of the search."""
-    of: Annotated[ClassName, tyro.conf.arg(name="class")] = "scheduler"
+    class_name: Annotated[ClassName, tyro.conf.arg(name="class")] = "scheduler"
     """Who decides: a scheduler with all measurements, every sensor locally, or the centre."""
     prices: Annotated[int, Whole(2, 100)] = 5
     """Number of prices of a token, from the lowest to the highest."""
@@ -64,10 +64,10 @@ class Search(EnvironmentOptions, Long):
         """Search, write and print the rule."""
         env_id, options, _ = environment_of(self.env, self.config, self.options)
         search = self.rule_search(env_id, options)
-        inputs: dict[str, Any] = {"env": env_id, "class": self.of, "prices": search.prices}
+        inputs: dict[str, Any] = {"env": env_id, "class": self.class_name, "prices": search.prices}
         inputs |= {"generations": self.generations, "settings": search.task.settings}
         self.earlier(inputs)  # refuses before it creates a folder
-        with alone_in(self.output, "output"):
+        with lock_folder(self.output, "output"):
             writing(("the generations and the rule", self.output))
             result = self.continued(search, inputs)
             write(self.output / _RESULT, asdict(result) | {"inputs": inputs})
@@ -78,7 +78,7 @@ class Search(EnvironmentOptions, Long):
         """Return the search of the class in this environment."""
         task = make_task(env_id, **options)
         prices = token_prices(env_id, options, task, self.prices)
-        result = search_of_class(self.of, task, prices, generations=self.generations)
+        result = search_of_class(self.class_name, task, prices, generations=self.generations)
         make_policy(result.text, task)
         return result
 

@@ -35,7 +35,7 @@ class EpisodeBatch(Runs):
     Args:
         task: The task.
         num_envs: Number N of runs.
-        remember: Owner of the memory: ``"scheduler"``, or ``"own"`` for every local sensor;
+        memory_owner: Owner of the memory: ``"scheduler"``, or ``"own"`` for every local sensor;
             ``None`` is the scheduler.
         reference: System on the same noise whose filter processes every measurement, for rewards in
             training. After each step ``reference_error`` (n, N) is the truth minus its estimate x*.
@@ -48,11 +48,11 @@ class EpisodeBatch(Runs):
         self,
         task: Task,
         num_envs: int,
-        remember: Owner | None = None,
+        memory_owner: Owner | None = None,
         reference: System[Any] | None = None,
         noise: NoiseSource | None = None,
     ) -> None:
-        memory = Memory(task, "scheduler" if remember is None else remember)
+        memory = Memory(task, "scheduler" if memory_owner is None else memory_owner)
         super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
         self.source: NoiseSource = PhiloxNoise() if noise is None else noise
@@ -64,7 +64,7 @@ class EpisodeBatch(Runs):
         self._shared = (
             reference is not None and memory.keeps_every and reference is task.memory_system
         )
-        self._beside: Any = None  # the reference's state, after sensing
+        self._reference_state: Any = None  # the reference's state, after sensing
         self.tokens = task.bucket.start(num_envs)
         self.queue = task.bucket.start_queue(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))
@@ -77,10 +77,10 @@ class EpisodeBatch(Runs):
 
     @classmethod
     def seeded(
-        cls, task: Task, episodes: int, seed: int, remember: Owner | None = None
+        cls, task: Task, episodes: int, seed: int, memory_owner: Owner | None = None
     ) -> EpisodeBatch:
-        """Return a batch after its first sensing, with the seeds ``seed``, ``seed + 1``, …"""
-        batch = cls(task, episodes, remember)
+        """Return a batch after its first sensing, with consecutive seeds from ``seed``."""
+        batch = cls(task, episodes, memory_owner)
         batch.seed(np.arange(episodes), [seed + i for i in range(episodes)])
         batch.reset()
         return batch
@@ -134,7 +134,9 @@ class EpisodeBatch(Runs):
         self.memory.begin(first, fresh, row, runs, self.num_envs)
         if self.reference is not None and not self._shared:
             beside = self.reference.sense(self.reference.start(first), row)
-            self._beside = beside if everyone else merge_runs(self._beside, beside, runs)
+            self._reference_state = (
+                beside if everyone else merge_runs(self._reference_state, beside, runs)
+            )
         fresh = system.sense(fresh, row)
         self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
         self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
@@ -167,7 +169,7 @@ class EpisodeBatch(Runs):
             self._draw(np.arange(self.num_envs))
         self.sense(self.normals())
         if self.reference is not None and not self._shared:
-            self._beside = self.reference.sense(self._beside, self.noise())
+            self._reference_state = self.reference.sense(self._reference_state, self.noise())
         self.finished = outcome.ended.copy()
         return outcome
 
@@ -207,7 +209,7 @@ class EpisodeBatch(Runs):
             beside = self.memory.states.every
         else:
             everyone = np.ones((self.task.sensors, self.num_envs), dtype=np.bool_)
-            self._beside = beside = arrived(system, self._beside, everyone)
+            self._reference_state = beside = arrived(system, self._reference_state, everyone)
         self.reference_error = system.truth(beside) - system.fused_mean(beside)
 
     def _lottery(self) -> Array | None:
@@ -230,5 +232,5 @@ class EpisodeBatch(Runs):
             for into, (key, first, count) in zip(drawn, parts, strict=False):
                 into[:count] = self.source.steps(*key, first, count, channels)
             beside = some[-1] - some[0] == len(some) - 1
-            chosen = slice(some[0], some[-1] + 1) if beside else some
-            lanes[:, chosen] = drawn.reshape(len(some), -1).T
+            places = slice(some[0], some[-1] + 1) if beside else some
+            lanes[:, places] = drawn.reshape(len(some), -1).T

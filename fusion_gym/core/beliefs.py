@@ -135,7 +135,7 @@ class Beliefs(ABC):
         Raises:
             ValueError: ``steps`` exceeds 1 for an owner without a model of the centre.
         """
-        _one(steps)
+        _require_single_step(steps)
         return self._weighted(self.difference)
 
     def value(self, steps: int = 1) -> Array:
@@ -147,7 +147,7 @@ class Beliefs(ABC):
         Raises:
             ValueError: ``steps`` exceeds 1 for an owner without a model of the centre.
         """
-        _one(steps)
+        _require_single_step(steps)
         return self._expected(self.loss(), self._weighted(self.best.mean - self.sent.mean))
 
     def _expected(self, silent: Array, sent: Array) -> Array:
@@ -157,7 +157,7 @@ class Beliefs(ABC):
     def _weighted(self, difference: Array) -> Array:
         return (self.task.relative_weights * (difference * difference)).sum(-2)
 
-    def _nobody(self, runs: int) -> Packets:
+    def _no_packets(self, runs: int) -> Packets:
         return np.zeros((self.task.sensors, runs), dtype=np.bool_)
 
 
@@ -167,16 +167,16 @@ class SchedulerBeliefs(Beliefs):
     @cached_property
     def silent(self) -> Estimate:
         """x̂, the centre's estimate without a transmission."""
-        return _of(self.task.system, self._silent)
+        return _fused(self.task.system, self._silent)
 
     @cached_property
     def sent(self) -> Estimate:
         """x̂(s); with ``packet="estimate"`` it is x* for every s."""
         if self.task.packet == "estimate":
             return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
-        if self.task.system.offers("fused_alone"):
-            return Estimate(*self.task.system.fused_alone(self._state))
-        each = [_of(self.task.system, delivered) for delivered in self._sent]
+        if self.task.system.offers("single_deliveries"):
+            return Estimate(*self.task.system.single_deliveries(self._state))
+        each = [_fused(self.task.system, delivered) for delivered in self._sent]
         return Estimate(
             np.concatenate([item.mean for item in each]),
             lambda: np.concatenate([item.covariance for item in each]),
@@ -185,12 +185,12 @@ class SchedulerBeliefs(Beliefs):
     @cached_property
     def best(self) -> Estimate:
         """x*, the estimate with all knowledge of the scheduler."""
-        return _of(self.task.memory_system or self.task.system, self.memory_posterior)
+        return _fused(self.task.memory_system or self.task.system, self.memory_posterior)
 
     @cached_property
     def memory_posterior(self) -> Any:
         """Memory state after the update; without memory the centre's state after all packets."""
-        everyone = ~self._nobody(self._runs)
+        everyone = ~self._no_packets(self._runs)
         if self.memory_states.every is None:
             return arrived(self.task.system, self._state, everyone)
         assert self.task.memory_system is not None
@@ -217,14 +217,14 @@ class SchedulerBeliefs(Beliefs):
 
     @cached_property
     def _silent(self) -> Any:
-        return self.task.system.deliver(self._state, self._nobody(self._runs))
+        return self.task.system.deliver(self._state, self._no_packets(self._runs))
 
     @cached_property
     def _sent(self) -> list[Any]:
         """The centre's states after each sensor's packet only."""
         result = []
         for sensor in range(self.task.sensors):
-            single = self._nobody(self._runs)
+            single = self._no_packets(self._runs)
             single[sensor] = True
             result.append(arrived(self.task.system, self._state, single))
         return result
@@ -246,9 +246,9 @@ class OwnBeliefs(Beliefs):
         """x̂, the centre's estimate without a transmission, as each sensor knows it."""
         system, sensors = self.task.system, self.task.sensors
         if self.task.broadcast == "none":
-            nobody = self._nobody(sensors * self._runs)
-            return self._each(system, system.deliver(self.memory_states.single, nobody))
-        received = _of(system, system.deliver(self._state, self._nobody(self._runs)))
+            silence = self._no_packets(sensors * self._runs)
+            return self._each(system, system.deliver(self.memory_states.single, silence))
+        received = _fused(system, system.deliver(self._state, self._no_packets(self._runs)))
         return Estimate(
             np.repeat(received.mean, sensors, axis=0),
             lambda: np.repeat(received.covariance, sensors, axis=0),
@@ -259,8 +259,8 @@ class OwnBeliefs(Beliefs):
         """x̂(s), the centre's estimate if only the packet of s arrives, as sensor s knows it."""
         system, itself = self.task.system, self._itself
         if self.memory_states.single is None:
-            if system.offers("fused_alone"):
-                return Estimate(*system.fused_alone(self._state))
+            if system.offers("single_deliveries"):
+                return Estimate(*system.single_deliveries(self._state))
             every = np.tile(np.arange(self._runs), self.task.sensors)
             return self._each(system, arrived(system, take_runs(self._state, every), itself))
         own = self._each(system, arrived(system, self.memory_states.single, itself))
@@ -289,7 +289,7 @@ class OwnBeliefs(Beliefs):
 
     def _each(self, system: System[Any], delivered: Any) -> Estimate:
         """Return one estimate per sensor from sensors · N runs."""
-        shape, whole = (self.task.sensors, self._runs), _of(system, delivered)
+        shape, whole = (self.task.sensors, self._runs), _fused(system, delivered)
 
         def apart(values: Array) -> Array:
             return np.moveaxis(values.reshape(*values.shape[:-1], *shape), -2, 0)
@@ -297,7 +297,7 @@ class OwnBeliefs(Beliefs):
         return Estimate(apart(whole.mean[0]), lambda: apart(whole.covariance[0]))
 
 
-def _one(steps: int) -> None:
+def _require_single_step(steps: int) -> None:
     if steps != 1:
         raise ValueError(
             f"steps = {steps} is not allowed here: it must be 1, for a sensor by itself cannot "
@@ -327,7 +327,7 @@ def arrived(system: System[Any], state: Any, packets: Packets) -> Any:
     return system.deliver(arriving(system, state, packets), packets)
 
 
-def _of(system: System[Any], delivered: Any) -> Estimate:
+def _fused(system: System[Any], delivered: Any) -> Estimate:
     return Estimate(system.fused_mean(delivered)[None], lambda: system.fused(delivered)[1][None])
 
 

@@ -28,17 +28,17 @@ class Communication(NamedTuple):
 def communication(scenario: Scenario) -> Communication:
     """Return the checked communication model of a scenario."""
     options = scenario.options
-    remembers, memory_system = options.memory, scenario.memory_system
-    if memory_system is None and not scenario.nodes_remember:
+    has_memory, memory_system = options.memory, scenario.memory_system
+    if memory_system is None and not scenario.nodes_have_memory:
         memory_system = scenario.system
-    if remembers and options.information == "centre":
+    if has_memory and options.information == "centre":
         raise ConfigurationError(
             "memory = True is not allowed with information='centre': it must be False, for the "
             "centre has nothing to remember but what was sent"
         )
-    if options.memory_filter is not None and not remembers:
+    if options.memory_filter is not None and not has_memory:
         raise validation.refusal("memory_filter", options.memory_filter, "None unless memory=True")
-    features = _features(options.belief_features, remembers)
+    features = _features(options.belief_features, has_memory)
     if features and options.information == "centre":
         raise validation.refusal(
             "belief_features", options.belief_features, "None or empty with information='centre'"
@@ -48,13 +48,13 @@ def communication(scenario: Scenario) -> Communication:
             "memory_filter", options.memory_filter, "None here, for this system has one filter"
         )
     if options.packet == "estimate":
-        _check_estimates(scenario, remembers)
-    return Communication(_broadcast(scenario), memory_system if remembers else None, features)
+        _check_estimates(scenario, has_memory)
+    return Communication(_broadcast(scenario), memory_system if has_memory else None, features)
 
 
-def _check_estimates(scenario: Scenario, remembers: bool) -> None:
+def _check_estimates(scenario: Scenario, has_memory: bool) -> None:
     reason = scenario.no_estimates
-    if not remembers:
+    if not has_memory:
         reason = "it holds what the scheduler remembers, which takes memory=True"
     elif scenario.system.offers("arriving") or not scenario.system.offers("adopt"):
         reason = reason or "this system's centre cannot go on from an estimate that is sent to it"
@@ -74,10 +74,10 @@ def _broadcast(scenario: Scenario) -> str:
     return value
 
 
-def _features(value: Any, remembers: bool) -> tuple[str, ...]:
+def _features(value: Any, has_memory: bool) -> tuple[str, ...]:
     """Return the observation entries of the memory, by default all with memory."""
     if value is None:
-        return FEATURES if remembers else ()
+        return FEATURES if has_memory else ()
     if value is True:
         return FEATURES
     values = (value,) if isinstance(value, str) else value

@@ -174,14 +174,14 @@ class Memory:
         return kind(self.task, state, self.states or MemoryStates(), best)
 
     def _sensed(self, states: MemoryStates, noise: Array) -> MemoryStates:
-        system, remembering = self.task.system, self.task.memory_system or self.task.system
+        system, memory_system = self.task.system, self.task.memory_system or self.task.system
         result = MemoryStates()
         if states.every is not None:
-            result.every = remembering.sense(states.every, noise)
+            result.every = memory_system.sense(states.every, noise)
         if states.own is not None or states.single is not None:
             noise = np.tile(noise, self.task.sensors)
         if states.own is not None:
-            result.own = remembering.sense(states.own, noise)
+            result.own = memory_system.sense(states.own, noise)
         if states.single is not None:
             result.single = system.sense(states.single, noise)
         return result

@@ -98,7 +98,7 @@ class Nature:
         largest = max((radius(end) for end in ends), default=0.0)
         if 2.0 * horizon * np.log10(max(largest, 1.0)) > np.log10(_LARGEST_GROWTH):
             raise ConfigurationError(
-                f"true_transition = {self._given('true_transition')} is not allowed with horizon = "
+                f"true_transition = {self._range('true_transition')} is not allowed with horizon = "
                 f"{horizon}: the true plant's spectral radius would be {largest:.4g}, and its "
                 f"square may grow by {_LARGEST_GROWTH:g} at most in an episode"
             )
@@ -107,11 +107,11 @@ class Nature:
         """Raise an error if the truth departs from the model, with place and reason."""
         for name in self.departing:
             raise ConfigurationError(
-                f"{name} = {self._given(name)} is not allowed {where}: it must be "
+                f"{name} = {self._range(name)} is not allowed {where}: it must be "
                 f"{_MODEL[list(DEPARTURES).index(name)]:g}, for {why}"
             )
 
-    def _given(self, name: str) -> str:
+    def _range(self, name: str) -> str:
         row = list(DEPARTURES).index(name)
         low, high = self.low[row], self.high[row]
         return f"{low:g}" if low == high else f"[{low:g}, {high:g}]"

@@ -70,14 +70,14 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     )
     admitted = Block(
         "admitted",
-        "whether the network's access rule admits the sensor in this step",
+        "whether the access rule admits the sensor in this step",
         lambda net: net.admitted(),
         (numbered(task.sensors),),
         node="own",
     )
     queue = Block(
         "queue",
-        "the sensor's place in the queue over the number of sensors, 0 for the head",
+        "place in the queue over the number of sensors, 0 for the head",
         lambda net: net.queue / task.sensors,
         (numbered(task.sensors),),
         node="own",
@@ -85,12 +85,12 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     )
     left = Block(
         "time_left",
-        "steps left of the episode over the horizon",
+        "remaining steps over the horizon",
         lambda net: net.left / task.horizon,
         node="broadcast",
         constants={"horizon": task.horizon},
     )
-    place = "place of a token's price in its range, in the logarithm"
+    place = "log(price/low) / log(high/low) of the price range"
     block = Block(
         "price",
         place,
@@ -128,15 +128,14 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
     states, nodes = task.system.state_names, numbered(task.sensors)
     differences = partial(
         Block,
-        meaning=f"arsinh of {_DIFFERENCE:g} times what is believed beyond the centre's estimate, "
-        "in nominal deviations",
+        meaning=f"arsinh({_DIFFERENCE:g} (x* − x̂)/σ), σ the nominal deviations",
         limit=_DIFFERENCE_LIMIT,
         constants={"nominal deviations": deviation[:, 0]},
     )
     values = partial(
         Block,
-        meaning=f"{_VALUE:g} times the signed root of the squared norm of that, and of what a "
-        "packet is expected to take off it, over the nominal error",
+        meaning=f"{_VALUE:g} sign(u) √|u|, u the squared norm of x* − x̂ (nobody) or v(m), over the "
+        "nominal error",
         limit=_VALUE_LIMIT,
         constants={"nominal error": whole, "squared norm": task.relative_weights[:, 0]},
     )
@@ -150,7 +149,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
     else:
         known: Knowledge = "scheduler_memory" if task.memory else "scheduler"
 
-        def one_by_one(beliefs: Beliefs) -> Array:
+        def scheduler_values(beliefs: Beliefs) -> Array:
             silent, sent = value(beliefs).swapaxes(0, 1)
             return np.concatenate((silent[:1], sent))
 
@@ -163,7 +162,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
             ),
             "value": values(
                 "transmission_value",
-                value=one_by_one,
+                value=scheduler_values,
                 labels=(("nobody", *nodes),),
                 knowledge=known,
             ),

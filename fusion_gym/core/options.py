@@ -180,7 +180,7 @@ class Scenario:
         feedback: Whether every node receives the centre's estimate by construction.
         memory_system: System on the same noise whose filter processes the unsent measurements;
             ``None`` is ``system``.
-        nodes_remember: Whether a packet holds all past measurements of its node, so that no
+        nodes_have_memory: Whether a packet holds all past measurements of its node, so that no
             ``memory_system`` is needed.
         no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
     """
@@ -191,7 +191,7 @@ class Scenario:
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
     feedback: bool = False
     memory_system: System[Any] | None = None
-    nodes_remember: bool = False
+    nodes_have_memory: bool = False
     no_estimates: str | None = None
 
 

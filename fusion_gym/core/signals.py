@@ -12,22 +12,22 @@ MEMORY_SIGNALS = (
         "belief_difference",
         "scheduler_memory",
         "(n, N)",
-        "what is believed beyond the centre's estimate if nobody transmits",
+        "x* − x̂, the scheduler's estimate minus the centre's without a transmission",
     ),
     Signal(
         "transmission_value",
         "scheduler_memory",
         "(sensors, N)",
-        "what each packet alone is expected to take off its squared norm, in weights of mean 1",
+        "v(m) = ‖x* − x̂‖² − E‖x* − x̂(m)‖², in weights of mean 1",
     ),
-    Signal("own_difference", "own_memory", "(sensors, n, N)", "the same as each sensor knows it"),
-    Signal("own_value", "own_memory", "(sensors, N)", "the same as each sensor knows it"),
+    Signal("own_difference", "own_memory", "(sensors, n, N)", "x* − x̂ of each sensor"),
+    Signal("own_value", "own_memory", "(sensors, N)", "v(m) of each sensor"),
 )
 # For policies that plan, and for saved agents.
 PLANNING_SIGNALS = (
-    Signal("model", "scheduler", "a state", "the system's state without what no policy may know"),
-    Signal("beliefs", "scheduler_memory", "beliefs", "what the scheduler believes of the state"),
-    Signal("own_beliefs", "own_memory", "beliefs", "what each sensor believes of the state"),
+    Signal("model", "scheduler", "a state", "the system's state without hidden parts"),
+    Signal("beliefs", "scheduler_memory", "beliefs", "the scheduler's belief of the state"),
+    Signal("own_beliefs", "own_memory", "beliefs", "each sensor's belief of the state"),
 )
 
 _OWN = ("own_beliefs", "own_difference", "own_value")
@@ -47,6 +47,6 @@ def missing_signals(owner: Owner) -> Mapping[str, str]:
     """Return the names of another owner's signals, and the reason for their absence."""
     why = (
         "is not there, for this batch does not keep what it needs: a policy that looks at what is "
-        "believed declares whose beliefs as an attribute, remember = 'scheduler' or 'own'"
+        "believed declares whose beliefs as an attribute, memory_owner = 'scheduler' or 'own'"
     )
     return {name: f"signal {name!r} {why}" for name in (_EVERY if owner == "own" else _OWN)}

@@ -25,12 +25,12 @@ Knowledge = Literal[
 ]  # fmt: skip
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)
 MEANING: dict[Knowledge, str] = {
-    "clock": "nothing but the time in the episode and the order of the last grants",
-    "centre": "what the fusion centre knows before anything is sent",
-    "own": "a sensor's new measurement and what the centre tells all sensors",
-    "scheduler": "all sensors' new measurements and what the centre knows",
-    "own_memory": "the same as own, and what that sensor measured and did not send",
-    "scheduler_memory": "the same as scheduler, and what all sensors measured and did not send",
+    "clock": "the time in the episode and the order of the last grants",
+    "centre": "the fusion centre's knowledge before a transmission",
+    "own": "a sensor's new measurement and the broadcasts",
+    "scheduler": "all sensors' new measurements and the centre's knowledge",
+    "own_memory": "own, and that sensor's unsent measurements",
+    "scheduler_memory": "scheduler, and all sensors' unsent measurements",
 }
 # Classes that each class covers besides itself.
 _BELOW: dict[Knowledge, tuple[Knowledge, ...]] = {
@@ -112,9 +112,9 @@ _COMMON: tuple[tuple[str, Knowledge, str], ...] = (
     ("expected_measurement", "centre", "expectation of the measurement"),
     ("innovation_deviation", "centre", "predicted standard deviation of the innovation"),
     ("prior_mean", "centre", "prediction of the fused estimate"),
-    ("prior_covariance", "centre", "covariance of that prediction"),
+    ("prior_covariance", "centre", "covariance of the prediction"),
     ("silent_variance", "centre", "weighted trace of the fused covariance without a delivery"),
-    ("variance_reduction", "centre", "fall of that trace if this sensor alone transmits"),
+    ("variance_reduction", "centre", "reduction of this trace by this sensor's packet"),
 )
 _COMMON_AXES = {
     "age": "(sensors, N)",
@@ -320,7 +320,7 @@ class Signals(Mapping[str, SignalArray]):
 # Methods and properties that a system may implement.
 CAPABILITIES = (
     *("adopt", "arrival_probability", "arriving", "covariance_cycle", "error_covariance"),
-    *("fused_alone", "imagination_channels", "imagine", "with_actual_covariance"),
+    *("single_deliveries", "imagination_channels", "imagine", "with_actual_covariance"),
 )
 
 
@@ -537,7 +537,7 @@ class System(ABC, Generic[StateT]):
         """
         raise self._missing("adopt")
 
-    def fused_alone(self, state: StateT) -> tuple[Array, Array]:
+    def single_deliveries(self, state: StateT) -> tuple[Array, Array]:
         """Return the fused estimates after a delivery of each single packet.
 
         Systems without losses offer it where one common computation is faster than one per sensor.
@@ -549,7 +549,7 @@ class System(ABC, Generic[StateT]):
             Means (sensors, n, N) and covariances (sensors, n, n, N). Entry i is :meth:`fused` after
             :meth:`deliver` of sensor i's packet only.
         """
-        raise self._missing("fused_alone")
+        raise self._missing("single_deliveries")
 
     @property
     def imagination_channels(self) -> int:

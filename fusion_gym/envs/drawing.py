@@ -65,7 +65,7 @@ class Film:
 
     def limits(self, run: int = 0) -> list[tuple[float, float]]:
         """Return the axis limits of each drawn state, for films side by side."""
-        truth, mean, deviation = self._shown_of(self._steps_of(run), run)
+        truth, mean, deviation = self._series(self._recent_steps(run), run)
         if not len(truth):
             return [(-1.0, 1.0)] * len(self._state_names)
         low, high = np.minimum(truth, mean).min(0), np.maximum(truth, mean).max(0)
@@ -81,7 +81,7 @@ class Film:
         """Return the picture of a run's present episode, by default with the step as title."""
         if self._figure is None:
             self._draw_frame()
-        age, steps = int(self._ages[run]), self._steps_of(run)
+        age, steps = int(self._ages[run]), self._recent_steps(run)
         times = np.arange(age - len(steps) + 1, age + 1)
         first = max(age - WINDOW, 0)
         self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
@@ -99,12 +99,12 @@ class Film:
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _steps_of(self, run: int) -> list[_Step]:
+    def _recent_steps(self, run: int) -> list[_Step]:
         """Return the recorded steps of this run's episode in the window."""
         age = int(self._ages[run])
         return list(self._steps)[-min(age, WINDOW) :] if age else []
 
-    def _shown_of(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
+    def _series(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
         """Return truth, fused estimate and two claimed deviations, each (steps, shown)."""
         system, visible = self.task.system, len(self._state_names)
         fused = [system.fused(step.state) for step in steps]
@@ -121,7 +121,7 @@ class Film:
         run: int,
         limits: Sequence[tuple[float, float]],
     ) -> None:
-        truth, mean, deviation = self._shown_of(steps, run)
+        truth, mean, deviation = self._series(steps, run)
         for place, (lines, ends) in enumerate(zip(self._curves, limits, strict=True)):
             axis, centre, wide = self._axes[place], mean[:, place], deviation[:, place]
             lines[0].set_data(times, truth[:, place])

@@ -34,9 +34,9 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     if spec is None:
         raise ConfigurationError("environments in one batch must be made by gym.make")
     base, _ = base_of(spec.id)  # the specification has the options too
-    if any(_made_with(other) != _made_with(spec) for other in specs):
+    if any(_spec_key(other) != _spec_key(spec) for other in specs):
         raise ConfigurationError(
-            f"different environments {display([_made_with(other) for other in specs])} are not "
+            f"different environments {display([_spec_key(other) for other in specs])} are not "
             "allowed in one batch: all must be made alike"
         )
     wrappers = [w.name for w in spec.additional_wrappers if w.name != Monitor.__name__]
@@ -56,6 +56,6 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     return batch
 
 
-def _made_with(spec: EnvSpec) -> Any:
+def _spec_key(spec: EnvSpec) -> Any:
     """Return the id, step limit and options that equal environments share."""
     return spec.id, spec.max_episode_steps, plain_options(spec.kwargs)

@@ -22,7 +22,9 @@ class Option(NamedTuple):
 # Options of every environment in addition to its dataclass.
 FOR_ALL = {
     "system": Option("str | None", None, "Path of a YAML file of options."),
-    "max_episode_steps": Option("int | None", None, "Steps to truncation; all scales stay."),
+    "max_episode_steps": Option(
+        "int | None", None, "Steps until truncation, without effect on scales."
+    ),
 }
 
 

@@ -6,7 +6,6 @@ additional entries the table marks. ``options`` takes ids and names of options.
 """
 
 import ast
-import inspect
 import re
 import shlex
 from dataclasses import replace
@@ -32,9 +31,9 @@ from fusion_gym.envs.views import is_received, make_view
 from fusion_gym.fusion.table import RULES
 
 LEGEND = """\
-A star marks what only the sensors know: `information="centre"` leaves it out. The third column
-tells what a sensor that decides by itself sees of these entries; with `broadcast="estimate"` it
-sees all without a star that belong to no sensor, with `broadcast="packets"` all without a star."""
+A star marks entries that only the sensors know; `information="centre"` omits them. The third column
+gives the entries that a local sensor observes. With `broadcast="estimate"` it also observes entries
+without a star that belong to no sensor, with `broadcast="packets"` all entries without a star."""
 
 _PAGE = Path(__file__).with_name("page.md")  # a template for page()
 # Network blocks of some tasks, and their conditions.
@@ -47,14 +46,14 @@ _NETWORK = {
 # Conditions of the belief blocks of the scheduler and of a local sensor.
 _BELIEFS: dict[Owner, str] = {
     "scheduler": "only with `memory=True` or `belief_features`",
-    "own": "only with `memory=True` or `belief_features`, for a sensor by itself",
+    "own": "only with `memory=True` or `belief_features`, for local sensors",
 }
 _SEES = {"own": "its own", "broadcast": "all", "hidden": "none"}
 _WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
 _ACTIONS = {
-    "single": "0 requests nobody, m requests sensor m - 1",
+    "single": "0 is no request, m requests sensor m - 1",
     "binary": "A 1 requests the sensor",
-    "discrete": "The number has a bit for each sensor, the lowest for sensor 0",
+    "discrete": "The number has a bit for each sensor, the lowest bit for sensor 0",
 }
 _LONGEST = 60  # characters of a default in a table
 # The function "module:name" that writes the table of each directive.
@@ -69,7 +68,7 @@ TABLES = {
 }
 
 _QUEUE = ", sensors share limited tokens in turns"
-_SECOND = f"v1: covariances may be singular{_QUEUE}; noise is counted, not drawn in sequence."
+_SECOND = f"v1: covariances may be singular{_QUEUE}; counters generate the noise."
 
 
 def page(env_id: str, task: Task | None = None) -> str:
@@ -119,9 +118,9 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     for name, other in others:
         for block in other.system.observation:
             rows.setdefault(block.name, _row(other, block, f"only with {name}"))
-    remembering = replace(task, memory=True, belief_features=task.belief_features or FEATURES)
+    with_memory = replace(task, memory=True, belief_features=task.belief_features or FEATURES)
     for owner, condition in _BELIEFS.items():
-        for block in belief_blocks(remembering, owner):
+        for block in belief_blocks(with_memory, owner):
             visible = bool(task.belief_features) and owner == "scheduler"
             rows[block.name] = _row(task, block, "" if visible else condition)
     always = [block.name for block in network_blocks(task)]
@@ -130,7 +129,7 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     network = replace(task, access="round_robin", bucket=turns, clock=True, reward=price)
     for block in network_blocks(network):
         rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])
-    return table(("entries", "range", "a sensor sees", "meaning"), rows.values())
+    return table(("entries", "range", "a sensor observes", "meaning"), rows.values())
 
 
 def option_table(text: str) -> str:
@@ -188,7 +187,7 @@ def fusion_table(env_id: str) -> str:
 
 
 def _paragraphs(kind: type[CommonOptions]) -> list[str]:
-    text = inspect.cleandoc(kind.__doc__ or "")
+    text = read(kind).text
     # The default docstring of a dataclass is its signature.
     return [] if text.startswith(f"{kind.__name__}(") else plain_marks(text).split("\n\n")
 
@@ -199,10 +198,10 @@ def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
     star = "" if covers("centre", block.knowledge) else " *"
     low, high = block.bounds
     meaning = plain_marks(block.meaning) + (f"; {condition}" if condition else "")
-    return name + star, f"{low:g}..{high:g}", _seen(task, block), meaning
+    return name + star, f"{low:g}..{high:g}", _visibility(task, block), meaning
 
 
-def _seen(task: Task, block: Block) -> str:
+def _visibility(task: Task, block: Block) -> str:
     """Return the part of a block that a local sensor observes."""
     entries = block_entries(block)
     return (

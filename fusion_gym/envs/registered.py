@@ -41,7 +41,7 @@ def _single(env_id: str) -> type:
     def __init__(self: FusionEnv, /, render_mode: str | None = None, **options: Any) -> None:
         FusionEnv.__init__(self, make_task(env_id, **options), render_mode)
 
-    return _made(env_id, FusionEnv, __init__)
+    return _environment_class(env_id, FusionEnv, __init__)
 
 
 def _vector(env_id: str) -> type:
@@ -56,10 +56,10 @@ def _vector(env_id: str) -> type:
         task = make_task(env_id, **options)
         FusionVectorEnv.__init__(self, task, num_envs, autoreset_mode, render_mode)
 
-    return _made(env_id, FusionVectorEnv, __init__)
+    return _environment_class(env_id, FusionVectorEnv, __init__)
 
 
-def _made(env_id: str, base: type, init: Any) -> type:
+def _environment_class(env_id: str, base: type, init: Any) -> type:
     """Return a class whose signature shows every option with its default."""
     own = list(inspect.signature(init).parameters.values())[:-1]
     named = [

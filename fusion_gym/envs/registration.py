@@ -33,7 +33,7 @@ class FusionSpec(EnvSpec):
     """Gymnasium's specification with the type and default of every option."""
 
     @classmethod
-    def of(cls, spec: EnvSpec) -> EnvSpec:
+    def from_spec(cls, spec: EnvSpec) -> EnvSpec:
         """Return a copy of a specification, a ``FusionSpec`` if this suite has the environment."""
         try:
             base_of(spec.id)

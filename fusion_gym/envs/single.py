@@ -90,7 +90,7 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
             ConfigurationError: ``options`` has an entry.
         """
         validation.reset_options(options, [])
-        if self._seeded is None and _stepped_one_by_one():
+        if self._seeded is None and _steps_singly():
             _warn_of_single_steps()
         super().reset(seed=seed)
         if self.np_random is not self._seeded:
@@ -151,7 +151,7 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         return self.view.masks(self.batch.grantable())[0]
 
 
-def _stepped_one_by_one() -> bool:
+def _steps_singly() -> bool:
     """Return whether a ``DummyVecEnv`` of Stable-Baselines3 calls the reset."""
     frame = sys._getframe(2)
     while frame.f_back is not None:

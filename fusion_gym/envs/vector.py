@@ -38,7 +38,7 @@ class Specified:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = None if spec is None else FusionSpec.of(spec)
+        self._spec = None if spec is None else FusionSpec.from_spec(spec)
         if self._spec is not None:
             self._spec.max_episode_steps = self.task.horizon
 
@@ -231,7 +231,7 @@ def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MOD
     """Return the render mode if it is ``None`` or one of ``modes``."""
     if render_mode is not None and render_mode not in modes:
         listed = ", ".join(map(repr, modes))
-        raise validation.UnexpectedArgumentError.of(
+        raise validation.UnexpectedArgumentError.for_argument(
             owner,
             "render_mode",
             f"render_mode = {render_mode!r} is not allowed: it must be None or one of {listed}",
@@ -274,9 +274,9 @@ def step_infos(outcome: Outcome) -> Infos:
 def reset_infos(task: Task, num_envs: int) -> Infos:
     """Return the info of a reset: zeros, as in a step without requests and errors."""
     none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
-    nobody = np.zeros((task.sensors, num_envs), dtype=np.bool_)
+    silence = np.zeros((task.sensors, num_envs), dtype=np.bool_)
     error = np.zeros((len(task.system.state_names), num_envs))
-    outcome = Outcome(none, none, none, none, nobody, nobody, error, error, never, never)
+    outcome = Outcome(none, none, none, none, silence, silence, error, error, never, never)
     return step_infos(outcome)
 
 

@@ -64,7 +64,7 @@ class SchedulerView:
         shape = self.actions.shape or ()
         array = _numbers(actions, shape if runs is None else (runs, *shape))
         if isinstance(self.actions, spaces.MultiBinary):
-            requests = _ones(array)
+            requests = _bits(array)
             return np.ascontiguousarray((requests[None] if runs is None else requests).T)
         high = int(self.actions.n) - 1
         _check(array, (array >= 0) & (array <= high) & (array == np.floor(array)), f"0..{high}")
@@ -158,7 +158,7 @@ class SensorView:
     def requests(self, actions: Any, runs: int | None) -> Requests:
         """Return the requests (sensors, N) of actions (N·sensors,), in which 1 is a request."""
         values = _numbers(actions, ((1 if runs is None else runs) * self.rows_per_run,))
-        return np.ascontiguousarray(_ones(values).reshape(-1, self.rows_per_run).T)
+        return np.ascontiguousarray(_bits(values).reshape(-1, self.rows_per_run).T)
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """Return the allowed choices (N·sensors, 2): silence and a request."""
@@ -198,7 +198,7 @@ def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     return values
 
 
-def _ones(values: NDArray[Any]) -> Requests:
+def _bits(values: NDArray[Any]) -> Requests:
     """Return where the actions are 1; the others must be 0."""
     requests: Requests = values == 1
     _check(values, requests | (values == 0), "0 or 1")

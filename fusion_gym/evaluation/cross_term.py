@@ -61,7 +61,7 @@ def cross_terms(
     seed: int,
     level: float = LEVEL,
 ) -> dict[str, CrossTerm]:
-    """Estimate the cross term under each policy, on the seeds ``seed``, ``seed + 1``, …
+    """Estimate the cross term under each policy, on consecutive seeds from ``seed``.
 
     All intervals hold together with the probability ``level`` (Bonferroni).
 

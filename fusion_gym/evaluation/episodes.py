@@ -69,7 +69,7 @@ def run_episodes(
     seed: int,
     progress: Callable[[int], Any] | None = None,
 ) -> EpisodeResults:
-    """Run a policy on the episodes of the seeds ``seed``, ``seed + 1``, …
+    """Run a policy on episodes with consecutive seeds from ``seed``.
 
     The same seed gives the same noise, so the results of two policies are paired.
 

@@ -86,10 +86,10 @@ def onnx_agreement(
     """
     rows = task.horizon * agent.view.rows_per_run
     episodes = math.ceil(observations / rows)
-    beside = _Beside(agent, graph, session(path))
-    run_episodes(task, beside, episodes, seed)
+    comparison = _FileComparison(agent, graph, session(path))
+    run_episodes(task, comparison, episodes, seed)
     return Agreement(
-        rows * episodes, episodes, beside.different, beside.difference, beside.relative
+        rows * episodes, episodes, comparison.different, comparison.difference, comparison.relative
     )
 
 
@@ -108,12 +108,12 @@ def latency(graph: DecisionGraph, path: Path) -> Latency:
     return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)))
 
 
-class _Beside:
+class _FileComparison:
     """The agent as a policy that also runs the ONNX session on every observation."""
 
     def __init__(self, agent: ModelPolicy, graph: DecisionGraph, run: Any) -> None:
         self.knowledge: Knowledge = agent.knowledge
-        self.remember = agent.remember
+        self.memory_owner = agent.memory_owner
         self._agent, self._graph, self._session = agent, graph, run
         self._columns = [agent.view.names.index(name) for name in graph.entries]
         self.different, self.difference, self.relative = 0, 0.0, 0.0
@@ -132,8 +132,8 @@ class _Beside:
         if "grantable" in self._graph.inputs:
             request["grantable"] = signals["grantable"].T.reshape(len(request["observation"]), -1)
         ours, theirs = self._memories
-        result = self._of_session(request | ours)
-        required = self._of_torch(request | theirs)
+        result = self._run_session(request | ours)
+        required = self._run_torch(request | theirs)
         self._memories = [_following(result), _following(required)]
         requests = self._agent(signals)
         decided = requests != result["request"].reshape(requests.shape[1], -1).T
@@ -147,10 +147,10 @@ class _Beside:
                 self.relative = max(self.relative, float(relative.max()))
         return requests
 
-    def _of_session(self, value: Values) -> Values:
+    def _run_session(self, value: Values) -> Values:
         return dict(zip(self._graph.outputs, self._session.run(None, value), strict=True))
 
-    def _of_torch(self, value: Values) -> Values:
+    def _run_torch(self, value: Values) -> Values:
         inputs = [torch.as_tensor(np.ascontiguousarray(value[name])) for name in self._graph.inputs]
         with torch.no_grad():
             result = self._graph(*inputs)

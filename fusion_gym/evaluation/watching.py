@@ -88,14 +88,14 @@ def watch(
 
 
 def _frames(watched: list[_Watched], steps: int) -> Iterator[Frame]:
-    yield _beside(watched)
+    yield _join_frames(watched)
     for _ in range(steps):
         for item in watched:
             item.step()
-        yield _beside(watched)
+        yield _join_frames(watched)
 
 
-def _beside(watched: list[_Watched]) -> Frame:
+def _join_frames(watched: list[_Watched]) -> Frame:
     """Return the pictures side by side, with common limits of their axes."""
     needed = zip(*(item.film.limits() for item in watched), strict=True)
     limits = [(min(low for low, _ in ends), max(high for _, high in ends)) for ends in needed]

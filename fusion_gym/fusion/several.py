@@ -66,9 +66,12 @@ class CovarianceIntersection(FusionRule):
         fused = np.take_along_axis(own, first[None, None, None], 0)[0]
         weights = (np.arange(len(means))[:, None] == first) * 1.0
         lanes = np.flatnonzero(active.sum(0) != 1)
-        metric = None if basis is None else _of(basis, lanes)
+        metric = None if basis is None else _select_lanes(basis, lanes)
         part = covariance_intersection_many(
-            _of(means, lanes), _of(own, lanes), _of(active, lanes), metric
+            _select_lanes(means, lanes),
+            _select_lanes(own, lanes),
+            _select_lanes(active, lanes),
+            metric,
         )
         mean[:, lanes], fused[..., lanes] = part.mean, part.covariance
         weights[:, lanes] = part.weights
@@ -117,23 +120,25 @@ def covariance_intersection_many(
     information = _informations(covariances, selected)
     metric = np.zeros_like(covariances[0])
     metric += linalg.identity(len(metric)) if basis is None else basis
-    weights, fused, open_lanes = _best_alone(covariances, information, metric, selected)
+    weights, fused, open_lanes = _best_single(covariances, information, metric, selected)
     singular = selected.any(0) & (~is_regular(covariances, information) & selected).any(0)
     open_lanes &= ~singular
     pairs = open_lanes & (selected.sum(0) == 2)
     lanes = np.flatnonzero(pairs)
     if lanes.size:
         weights[:, lanes], fused[..., lanes] = best_of_pair(
-            _of(covariances, lanes), _of(selected, lanes), _of(metric, lanes)
+            _select_lanes(covariances, lanes),
+            _select_lanes(selected, lanes),
+            _select_lanes(metric, lanes),
         )
     lanes = np.flatnonzero(open_lanes & ~pairs)
     if lanes.size:
-        taking_part = _of(selected, lanes)
-        start = taking_part / np.abs(_of(linalg.trace(covariances), lanes))
+        taking_part = _select_lanes(selected, lanes)
+        start = taking_part / np.abs(_select_lanes(linalg.trace(covariances), lanes))
         np.copyto(start, 0.0, where=~taking_part)
         start /= sum_rows(start)
         weights[:, lanes], fused[..., lanes] = _search(
-            _of(information, lanes), _of(metric, lanes), start
+            _select_lanes(information, lanes), _select_lanes(metric, lanes), start
         )
     vector = np.zeros_like(means[0])
     for weight, item, mean, takes_part in zip(weights, information, means, selected, strict=True):
@@ -141,11 +146,11 @@ def covariance_intersection_many(
     joined = linalg.matvec(fused, vector)
     lanes = np.flatnonzero(singular)
     if lanes.size:
-        own, taking_part = _of(covariances, lanes), _of(selected, lanes)
+        own, taking_part = _select_lanes(covariances, lanes), _select_lanes(selected, lanes)
         part, weights[:, lanes], fused[..., lanes] = _constrained(
-            own, taking_part, _of(metric, lanes)
+            own, taking_part, _select_lanes(metric, lanes)
         )
-        known = np.where(taking_part[:, None], _of(means, lanes), 0.0)
+        known = np.where(taking_part[:, None], _select_lanes(means, lanes), 0.0)
         joined[:, lanes] = sum_rows(linalg.matvec(part, known))
 
     def gains() -> Array:
@@ -205,11 +210,13 @@ def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
     information = np.zeros_like(covariances)
     for estimate, takes_part in enumerate(selected):
         lanes = np.flatnonzero(takes_part)
-        information[estimate][..., lanes] = linalg.inverse(_of(covariances[estimate], lanes))
+        information[estimate][..., lanes] = linalg.inverse(
+            _select_lanes(covariances[estimate], lanes)
+        )
     return information
 
 
-def _of(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
+def _select_lanes(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
     """Return the given runs with a contiguous batch axis."""
     return array.take(lanes, axis=-1)
 
@@ -230,7 +237,7 @@ def _total(terms: Array) -> Array:
     return sum_rows(np.moveaxis(terms, -2, 0))  # NumPy sums contiguous axes in pairs
 
 
-def _best_alone(
+def _best_single(
     covariances: Array, information: Array, basis: Array, selected: NDArray[np.bool_]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return weights and covariance of the single best estimate, and where it is not optimal.
@@ -251,12 +258,12 @@ def _best_alone(
     first = traces.argmin(0)
     weights = ((np.arange(len(traces))[:, None] == first) & selected) * 1.0
     fused = np.take_along_axis(covariances, first[None, None, None], 0)[0]
-    nobody = ~selected.any(0)
-    fused[..., nobody] = np.nan
+    empty = ~selected.any(0)
+    fused[..., empty] = np.nan
     gain = _gain(information, linalg.matmul(fused, linalg.transpose(basis)))
-    total = np.where(nobody, np.nan, traces.min(0))
+    total = np.where(empty, np.nan, traces.min(0))
     closed = gain.max(0) - total <= _GAP * total
-    return weights, fused, ~(closed | nobody)
+    return weights, fused, ~(closed | empty)
 
 
 def _gain(information: Array, spread: Array) -> Array:
@@ -281,14 +288,22 @@ def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Arra
         open_lanes = worse | (gain.max(0) - total > _GAP * total)
         if not open_lanes.all():
             closed, still = np.flatnonzero(~open_lanes), np.flatnonzero(open_lanes)
-            weights[:, lanes[closed]] = _of(new, closed)
-            fused[..., lanes[closed]] = _of(covariance, closed)
+            weights[:, lanes[closed]] = _select_lanes(new, closed)
+            fused[..., lanes[closed]] = _select_lanes(covariance, closed)
             if not still.size:
                 return weights, fused
-            lanes, information, worse = lanes[still], _of(information, still), worse[still]
-            root, spread, gain = _of(root, still), _of(spread, still), _of(gain, still)
-            basis = _of(basis, still)
-            old, new = _of(old, still), _of(new, still)
+            lanes, information, worse = (
+                lanes[still],
+                _select_lanes(information, still),
+                worse[still],
+            )
+            root, spread, gain = (
+                _select_lanes(root, still),
+                _select_lanes(spread, still),
+                _select_lanes(gain, still),
+            )
+            basis = _select_lanes(basis, still)
+            old, new = _select_lanes(old, still), _select_lanes(new, still)
             total, lowest = total[still], lowest[still]
         target = _newton(information, new, root, spread, gain, total)
         target = np.where(worse, 0.5 * (old + new), target)
@@ -358,9 +373,11 @@ def _newton(
     for _ in range(len(weights) - 1):
         if not lanes.size:
             break
-        reached[:, lanes], blocking = _as_far(_of(reached, lanes), _of(target, lanes))
-        mask = _of(free, lanes) & ~blocking
-        trial = _model_minimum(_of(curvature, lanes), _of(gain, lanes), mask)
+        reached[:, lanes], blocking = _as_far(
+            _select_lanes(reached, lanes), _select_lanes(target, lanes)
+        )
+        mask = _select_lanes(free, lanes) & ~blocking
+        trial = _model_minimum(_select_lanes(curvature, lanes), _select_lanes(gain, lanes), mask)
         free[:, lanes], target[:, lanes] = mask, trial
         lanes = lanes[(trial < 0.0).any(0)]
     target /= sum_rows(target)
@@ -368,7 +385,9 @@ def _newton(
     unsound = np.flatnonzero(~sound)
     if unsound.size:
         target[:, unsound] = _exchange(
-            _of(weights, unsound), _of(gain, unsound), _of(curvature, unsound)
+            _select_lanes(weights, unsound),
+            _select_lanes(gain, unsound),
+            _select_lanes(curvature, unsound),
         )
     return target
 

@@ -68,17 +68,17 @@ _IN_TURN = partial(SequentialIntersection, covariance_intersection)
 _INVERSE = partial(SequentialIntersection, inverse_covariance_intersection)
 RULES = {
     "federated": FusionRow(
-        InformationFusion, "information shares", "Sum of informations, fed back in shares."
+        InformationFusion, "information shares", "Sum of information, fed back in shares."
     ),
-    "information": FusionRow(InformationFusion, "independence", "Sum of informations."),
+    "information": FusionRow(InformationFusion, "independence", "Sum of information."),
     "matrix": FusionRow(
-        MatrixWeightedFusion, "joint covariance", "Sum with the best matrix weights.", cubic=True
+        MatrixWeightedFusion, "joint covariance", "Sum with optimal matrix weights.", cubic=True
     ),
     "sici": FusionRow(
-        _INVERSE, "common information", "Inverse covariance intersection, two by two.", ordered=True
+        _INVERSE, "common information", "Sequential inverse covariance intersection.", ordered=True
     ),
     "sci": FusionRow(
-        _IN_TURN, "nothing", "Covariance intersection, two by two: a bound.", ordered=True
+        _IN_TURN, "nothing", "Sequential covariance intersection: a bound.", ordered=True
     ),
     "ci": FusionRow(
         CovarianceIntersection,
@@ -87,7 +87,10 @@ RULES = {
         cubic=True,
     ),
     "exact_ci": FusionRow(
-        CovarianceIntersection, "tracked weights", "The same with exact weights.", cubic=True
+        CovarianceIntersection,
+        "tracked weights",
+        "Covariance intersection of all with exact weights: a bound.",
+        cubic=True,
     ),
     "ici": FusionRow(
         _INVERSE, "common information", "Inverse covariance intersection of a pair.", pair=True

@@ -59,7 +59,7 @@ def pareto(
 
 
 def _plain_tick(value: float, place: float | None = None) -> str:
-    """Return the label of a logarithmic axis: 0.1, 0.2, 0.3, 0.5, 1, …"""
+    """Return the label of a logarithmic axis at 1, 2, 3 and 5 times powers of ten."""
     text = f"{value:g}"
     return text if f"{value:.0e}"[0] in "1235" else ""
 

@@ -14,7 +14,7 @@ from fusion_gym.validation import ConfigurationError
 
 
 @contextmanager
-def alone_in(folder: Path, name: str) -> Iterator[None]:
+def lock_folder(folder: Path, name: str) -> Iterator[None]:
     """Lock a folder for this process, create it if needed, and remove old partial files."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -26,7 +26,7 @@ class Policy(Protocol):
     the signals of one step and returns requests (sensors, N) bool. A run begins a new episode where
     ``signals["start"]`` is true.
 
-    A policy that uses beliefs (:mod:`fusion_gym.core.signals`) has an attribute ``remember``,
+    A policy that uses beliefs (:mod:`fusion_gym.core.signals`) has an attribute ``memory_owner``,
     ``"scheduler"`` or ``"own"``, the owner of the beliefs. A policy that uses only the signals of
     the present step may have a true attribute ``stateless``; simulations may then call it inside an
     episode.
@@ -48,10 +48,10 @@ class Policy(Protocol):
 
 def owner_of(policy: Policy) -> Owner | None:
     """Return the owner of the beliefs that a policy uses, or ``None`` if it uses no beliefs."""
-    result = getattr(policy, "remember", None)
+    result = getattr(policy, "memory_owner", None)
     if result is None:
         return None
-    validation.choice("remember", result, get_args(Owner))
+    validation.choice("memory_owner", result, get_args(Owner))
     owner: Owner = result
     return owner
 
@@ -141,7 +141,7 @@ def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:
 
 def not_negative_parameter(name: str, value: Any) -> None:
     """Check that a parameter is one number >= 0 or a sequence of such numbers."""
-    validation.not_negative(name, value, validation.one_or_each(value))
+    validation.not_negative(name, value, validation.parameter_shape(value))
 
 
 def each_number(name: str, value: Any, **limits: float) -> None:

@@ -27,7 +27,7 @@ class BeliefRule(Rule):
         super().__post_init__()
         only = {name: getattr(self, name) for name in self.together}
         check_owner(self.task, self.own, **only)
-        self.remember: Owner | None = "own" if self.own else "scheduler"
+        self.memory_owner: Owner | None = "own" if self.own else "scheduler"
 
     @property
     def knowledge(self) -> Knowledge:

@@ -161,7 +161,9 @@ def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) ->
     names = [name for name, kind in ACTIVATIONS.items() if kind is policy.activation_fn]
     if not names:
         return entries
-    network = NetworkShape.of({name: tuple(w.shape) for name, w in policy.state_dict().items()})
+    network = NetworkShape.from_shapes(
+        {name: tuple(w.shape) for name, w in policy.state_dict().items()}
+    )
     plain = {"activation": names[0], "actions": str(model.action_space), "network": network.plain()}
     return {"format": FORMAT} | entries | plain
 

@@ -76,7 +76,9 @@ def _rebuilt(
 ) -> tuple[BaseAlgorithm, str]:
     """Return the model from its card and its weights, and its kind of action."""
     blueprint, weights = Blueprint.read(data), read_weights(file)
-    network = NetworkShape.of({name: tuple(weight.shape) for name, weight in weights.items()})
+    network = NetworkShape.from_shapes(
+        {name: tuple(weight.shape) for name, weight in weights.items()}
+    )
     if blueprint.network not in (None, network.plain()):
         raise ConfigurationError(
             f"its card's network is not that of its weights, {network.plain()}"

@@ -66,7 +66,7 @@ class Lookahead:
     """
 
     stateless: ClassVar[bool] = True
-    remember: ClassVar[Owner] = "scheduler"
+    memory_owner: ClassVar[Owner] = "scheduler"
 
     def __init__(self, task: Task, price: float = 0.01, steps: int = 4) -> None:
         self.steps = validation.integer("steps", steps, at_least=1, at_most=validation.MOST_STEPS)
@@ -113,9 +113,9 @@ class Lookahead:
         """Return the requests (sensors, N)."""
         model = PlanningModel(self._task, signals)
         best = model.best_means(self.steps)
-        return self._one_by_one(model, best) if self.greedy else self._of_all_sets(model, best)
+        return self._greedy_set(model, best) if self.greedy else self._best_set(model, best)
 
-    def _of_all_sets(self, model: PlanningModel, best: Array) -> Requests:
+    def _best_set(self, model: PlanningModel, best: Array) -> Requests:
         everyone = np.ones((self._task.sensors, model.runs), dtype=np.bool_)
         grants = [model.grant(selected & everyone) for selected in self._sets[:, :, None]]
         cost = self._expected_error(model, best)
@@ -125,7 +125,7 @@ class Lookahead:
             cost[place, (grants[place].granted != selected).any(0)] = np.inf
         return np.ascontiguousarray(self._sets[cost.argmin(0)].T)
 
-    def _one_by_one(self, model: PlanningModel, best: Array) -> Requests:
+    def _greedy_set(self, model: PlanningModel, best: Array) -> Requests:
         sensors, lanes = self._task.sensors, np.arange(model.runs)
         arrival = np.ones((sensors, model.runs)) if model.arrival is None else model.arrival
         selected = np.zeros((sensors, model.runs), dtype=np.bool_)

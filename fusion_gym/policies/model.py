@@ -60,7 +60,7 @@ class ModelPolicy:
         self._memory: Any = None  # of a recurrent policy
         self.stateless = deterministic and not isinstance(model, RecurrentPPO)
         self.knowledge: Knowledge = self.view.knowledge
-        self.remember = self.view.owner
+        self.memory_owner = self.view.owner
         if isinstance(model, RecurrentPPO) and self.knowledge != "centre":
             self.knowledge = least_covering((self.knowledge, "own_memory"))
         span = self.task.reward.price.span

@@ -31,7 +31,7 @@ class NetworkShape:
     memory: _Memory | None = None
 
     @classmethod
-    def of(cls, shapes: Shapes) -> NetworkShape:
+    def from_shapes(cls, shapes: Shapes) -> NetworkShape:
         """Return the networks that have weights of these shapes, after a check of all sizes."""
         if f"{_VALUES}.0.weight" in shapes:
             *hidden, last = _chain(shapes, _VALUES)
@@ -51,8 +51,8 @@ class NetworkShape:
 
     def fits(self, algorithm: str) -> bool:
         """Return whether policies of this algorithm have such networks."""
-        values, remembers = "q" in self.hidden, self.memory is not None
-        return (values, remembers) == (algorithm == "dqn", algorithm == "recurrent_ppo")
+        values, has_memory = "q" in self.hidden, self.memory is not None
+        return (values, has_memory) == (algorithm == "dqn", algorithm == "recurrent_ppo")
 
     def plain(self) -> dict[str, Any]:
         """Return the sizes as JSON."""

@@ -27,7 +27,7 @@ _LONGEST = 1000  # steps until traces settle, at most
 _SETTLED = 1e-9  # relative change of a settled trace from one cycle to the next
 AVERAGES = ("steady", "episode")
 
-_found: dict[str, Schedule] = {}
+_cache: dict[str, Schedule] = {}
 
 
 class PeriodicOptimum:
@@ -146,12 +146,12 @@ def optimum(
         ConfigurationError: the system's covariances depend on the data.
     """
     key = schedule_key(system, packets, period, steps)
-    if key not in _found:
+    if key not in _cache:
         stored = load_schedule(cache, key, packets, (period, system.sensor_count))
-        _found[key] = _search(system, packets, period, steps) if stored is None else stored
+        _cache[key] = _search(system, packets, period, steps) if stored is None else stored
     if cache is not None:
-        store_schedule(cache, key, _found[key])
-    return _found[key]
+        store_schedule(cache, key, _cache[key])
+    return _cache[key]
 
 
 def steady_traces(system: System[Any], schedules: Patterns) -> Array:

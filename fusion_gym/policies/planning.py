@@ -16,8 +16,8 @@ from fusion_gym.policies.belief_rule import beliefs_of
 def transmission_sets(task: Task) -> NDArray[np.bool_]:
     """Return every set of sensors that may transmit together (sets, sensors), silence first."""
     if task.access == "single":
-        nobody = np.zeros((1, task.sensors), dtype=np.bool_)
-        return np.concatenate((nobody, np.eye(task.sensors, dtype=np.bool_)[::-1]))
+        silence = np.zeros((1, task.sensors), dtype=np.bool_)
+        return np.concatenate((silence, np.eye(task.sensors, dtype=np.bool_)[::-1]))
     return np.array(list(product((False, True), repeat=task.sensors)))
 
 

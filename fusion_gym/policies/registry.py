@@ -183,13 +183,13 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     """
     context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)
-    if _kind(_asked(spec)[1]) != "agent":  # the loader has checked its observation
+    if _kind(_parse_policy(spec)[1]) != "agent":  # the loader has checked its observation
         _try_out(spec, policy, task)
     return policy
 
 
 def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> Policy:
-    name, row, text = _asked(spec)
+    name, row, text = _parse_policy(spec)
     maker = _maker(row)
     known = _parameters(name, maker)
     arguments: dict[str, Any] = {}
@@ -228,7 +228,7 @@ def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:
     return text, {}
 
 
-def _asked(spec: str) -> tuple[str, PolicyRow, str]:
+def _parse_policy(spec: str) -> tuple[str, PolicyRow, str]:
     """Return the name of a policy, its row, and the text after its name."""
     if not isinstance(spec, str):
         raise refusal("policy", spec, "the text that names a policy")

@@ -75,7 +75,7 @@ class Rollout:
     """
 
     stateless: ClassVar[bool] = False  # it draws
-    remember: ClassVar[Owner] = "scheduler"
+    memory_owner: ClassVar[Owner] = "scheduler"
     rest: ClassVar[str] = "base"
 
     def __init__(

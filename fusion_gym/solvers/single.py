@@ -85,15 +85,15 @@ def source_thresholds(advantage: Array, points: Array) -> tuple[Array, bool]:
         advantage: cost of silence minus cost of a request (M, ...).
         points: errors (M,).
     """
-    asks = advantage >= 0.0
-    first = np.argmax(asks, axis=0)
+    requests = advantage >= 0.0
+    first = np.argmax(requests, axis=0)
     here = np.take_along_axis(advantage, first[None], 0)[0]
     before = np.take_along_axis(advantage, np.maximum(first - 1, 0)[None], 0)[0]
     with np.errstate(invalid="ignore"):
         part = np.where(first > 0, here / np.where(here > before, here - before, 1.0), 0.0)
     result = points[first] - part * points[1]
-    ordered = bool(np.all(np.diff(asks.astype(np.int8), axis=0) >= 0))
-    return np.where(asks.any(0), result, np.inf), ordered
+    ordered = bool(np.all(np.diff(requests.astype(np.int8), axis=0) >= 0))
+    return np.where(requests.any(0), result, np.inf), ordered
 
 
 @dataclass(frozen=True)

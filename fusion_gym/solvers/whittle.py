@@ -13,15 +13,15 @@ from fusion_gym.validation import ConfigurationError
 _PRICES = np.geomspace(0.02, 5000.0, 32)  # prices of the solved optima, in units of w σ²
 
 # Cache of the tables by everything but the price, for sweeps.
-_found: dict[bytes, tuple[Array, Array]] = {}
+_cache: dict[bytes, tuple[Array, Array]] = {}
 
 
 def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
     """Return prices (P,) and the thresholds (P, S) at these prices."""
     key = pickle.dumps(replace(problem, price=0.0))
-    if key not in _found:
-        _found[key] = _solved(number, problem)
-    return _found[key]
+    if key not in _cache:
+        _cache[key] = _solved(number, problem)
+    return _cache[key]
 
 
 def _solved(number: int, problem: SourceProblem) -> tuple[Array, Array]:

@@ -161,8 +161,9 @@ class LinearPlant(Plant):
         return np.array([np.diagonal(moment) for moment in self.moments(horizon, start)])
 
     def moments(self, horizon: int, square: float | Array = 0.0) -> Iterator[Array]:
-        """Yield the error's covariance (n, n) at t = 0..horizon; ``square`` m mᵀ adds the mean's
-        square.
+        """Yield the error's covariances (n, n) at t = 0..horizon.
+
+        ``square`` m mᵀ of the initial mean m gives the state's second moments instead.
         """
         transition, process = self.transition[..., 0], self.process_covariance[..., 0]
         moment = self.initial_covariance[..., 0] + square

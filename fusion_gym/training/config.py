@@ -85,8 +85,8 @@ class Experiment(Strict):
             for name in ("reward_scale", "price_range")
             if options.get(name, "auto") == "auto" and settings[name] is not None
         }
-        given = {name: value for name, value in options.items() if name not in numbers}
-        environment = self.environment.model_copy(update={"options": given | numbers})
+        constants = {name: value for name, value in options.items() if name not in numbers}
+        environment = self.environment.model_copy(update={"options": constants | numbers})
         share = min((training.many_sensors or sensors) / sensors, 1.0)
         length = {"timesteps": round(training.timesteps * share), "many_sensors": None}
         training = training.model_copy(update=length)

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from fusion_gym.arrays import Array
 from fusion_gym.envs.privileged import PrivilegedVecEnv
-from fusion_gym.training.decisions import Chosen, Decisions, Kind
+from fusion_gym.training.decisions import Choices, Decisions, Kind
 from fusion_gym.validation import ConfigurationError
 
 _CLOSED = -1e8  # the logit of a masked choice
@@ -322,7 +322,7 @@ class _Step(NamedTuple):
 
     observation: torch.Tensor
     masks: torch.Tensor | None
-    choices: Chosen
+    choices: Choices
     old: torch.Tensor
     values: Array
     follows: Array

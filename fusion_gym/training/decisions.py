@@ -15,7 +15,7 @@ from fusion_gym.validation import ConfigurationError
 Kind = Literal["all", "flips"]
 MOST_ALTERNATIVES = 8  # largest number of sets of requests for the default "all"
 MOST_SENSORS = 10  # largest number of sensors for "all"
-Chosen = NDArray[np.int64]  # choices (runs, D)
+Choices = NDArray[np.int64]  # choices (runs, D)
 
 
 class Decisions:
@@ -96,7 +96,7 @@ class Decisions:
         """Return the local views (runs, sensors, entries) of observations (runs, entries)."""
         return self.by_run(self.view.rows(observation))
 
-    def actions(self, choice: Chosen) -> NDArray[Any]:
+    def actions(self, choice: Choices) -> NDArray[Any]:
         """Return the actions of the rows from the choices (runs, D)."""
         if not self.binary:
             return choice.reshape(-1)
@@ -104,14 +104,14 @@ class Decisions:
             return choice
         return choice >> np.arange(self.sensors) & 1
 
-    def alternatives(self, choice: Chosen) -> NDArray[Any]:
+    def alternatives(self, choice: Choices) -> NDArray[Any]:
         """Return the alternative requests (A, sensors, N) of the choices (runs, D)."""
         if self.kind == "all":
             return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
         taken = choice.T == 1
         return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
 
-    def arranged(self, choice: Chosen, taken: Array, stepped: Array) -> Array:
+    def arranged(self, choice: Choices, taken: Array, stepped: Array) -> Array:
         """Return the values (runs, D, C) of all choices, from taken and stepped (A, runs) ones."""
         if self.kind == "all":
             return stepped.T[:, None]

@@ -15,7 +15,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.importing import trust_files
 from fusion_gym.output.files import replacing, write, write_text
-from fusion_gym.output.folders import alone_in, check_inputs, fingerprint
+from fusion_gym.output.folders import check_inputs, fingerprint, lock_folder
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.checkpoint import Journal, read_journal, restore
@@ -93,7 +93,7 @@ def train(
     experiment = experiment.resolved(env.task.settings, env.task.sensors)
     earlier(experiment, folder, resume)  # refuses before it creates a folder
     torch.set_num_threads(experiment.training.threads)
-    with alone_in(folder, "output"):
+    with lock_folder(folder, "output"):
         journal = earlier(experiment, folder, resume)
         if journal is None:
             journal = Journal(experiment.inputs())

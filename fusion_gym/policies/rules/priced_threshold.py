@@ -116,7 +116,7 @@ class PricedThreshold(BeliefRule):
         else:
             super().__post_init__()
         if self.score != "value":
-            self.remember = None
+            self.memory_owner = None
         columns = (self.column(name, self.task.sensors) for name in ThresholdNumbers._fields)
         self.numbers = ThresholdNumbers(*columns)
 

@@ -45,6 +45,14 @@ class CorrelatedTrackingOptions(PaperOptions):
     The defaults are the paper's Section 6. The paper does not give, and we chose: ``horizon`` (the
     paper runs 600 steps), the token bucket (the paper has none, hence ``tokens="unlimited"``) and
     the reward.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
+        >>> options = CorrelatedTrackingOptions(noise_scale=0.5, horizon=50)
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.horizon, task.bucket.unlimited
+        (3, 50, True)
     """
 
     filters: ClassVar[Mapping[str, type]] = {"": RobustKalmanFilter}  # without a choice

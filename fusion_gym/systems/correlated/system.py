@@ -44,7 +44,7 @@ RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
 class CorrelatedTrackingState:
     """The state of N runs at one time; n states, l sensors, m components.
 
-    Estimate 0 is the fused one and estimate i that of node i. ``truth`` (n, N) · ``scale`` (N,),
+    Estimate 0 is the fused one and estimate i is node i's. ``truth`` (n, N) · ``scale`` (N,),
     actual variances over their bounds · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last
     delivered measurement · ``age`` (l, N), steps since then · ``prior_mean`` (l + 1, n, N),
     ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``outcomes`` at
@@ -68,7 +68,7 @@ class CorrelatedTrackingState:
     departure: Array | None = None
 
 
-SIGNALS = common_signals(prior_covariance="conservative covariance of that prediction")
+SIGNALS = common_signals(prior_covariance="conservative covariance of the prediction")
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             block("whitened_innovation", innovation, self._whitened, components, "own", "own"),
             block(
                 "fused_innovation",
-                "the same against the fused prediction",
+                "innovation of the fused prediction over its predicted deviation",
                 self._fused_innovation,
                 components,
                 "scheduler",
@@ -144,7 +144,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             ),
             block(
                 "log_deviation",
-                "the same of the fused prediction",
+                "logarithm of the fused predicted over the open-loop deviation",
                 lambda s: log_deviation(s.prior_covariance[0], self.reference),
                 (states,),
                 constants=open_loop,

@@ -78,7 +78,7 @@ CENTRAL_SIGNALS = (
         "(sensors, 1, N)",
         measurement="the new measurement, or the held one if the sensor does not sample",
         innovation="measurement minus its expectation, 0 if the sensor does not sample",
-        variance_reduction="fall of that trace by the best linear use of this sensor's sample",
+        variance_reduction="reduction of this trace by a linear update with this sample",
     ),
     *OF_FAMILY,
 )

@@ -150,7 +150,7 @@ class CentralisedLinearFilter:
         $$
 
         with the model of
-        :class:`~fusion_gym.systems.markov_jump.linear_minimum_variance.LocalFilters`, w anew with
+        :class:`~fusion_gym.systems.markov_jump.linear_minimum_variance.LocalFilters`, a new w with
         mean 0 and covariance Q, and Q_c the covariance of ξ.
 
     Assumes: a Markov jump system whose mode nobody sees, and transmissions that are not chosen

@@ -60,6 +60,14 @@ class MarkovJumpTrackingOptions(PaperOptions):
 
     The defaults are the paper's Section 6. The paper does not give, and we chose: ``horizon``, the
     token bucket (the paper has none, hence ``tokens="unlimited"``) and the reward.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
+        >>> options = MarkovJumpTrackingOptions(filter="imm", sampling_periods=(1, 1, 2))
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.system.state_names
+        (3, ('position', 'velocity'))
     """
 
     filters: ClassVar[Mapping[str, type]] = FILTERS
@@ -135,10 +143,10 @@ def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
     system = _system(options.filter, options.fusion, plant, sensors, weights, horizon, nature)
-    remembering = None
+    memory_system = None
     if (kind := options.memory_filter) is not None:
         fusion = options.fusion if kind == options.filter else None
-        remembering = _system(kind, fusion, plant, sensors, weights, horizon, nature)
+        memory_system = _system(kind, fusion, plant, sensors, weights, horizon, nature)
     defaults, refusal = {}, None
     if isinstance(system, MarkovJumpSystem):
         defaults = {"local_variance": {"reference": float(system.full_rate_traces().mean())}}
@@ -148,8 +156,8 @@ def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
         system,
         system.state_weights,
         defaults,
-        memory_system=remembering,
-        nodes_remember=refusal is not None,
+        memory_system=memory_system,
+        nodes_have_memory=refusal is not None,
         no_estimates=refusal,
     )
 

@@ -1,7 +1,7 @@
 """Interacting multiple models: one Kalman filter a mode, mixed by the mode's probabilities.
 
 Source: H. A. P. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for systems with
-Markovian switching coefficients", IEEE Trans. Automatic Control 33, 1988; the system is that of
+Markovian switching coefficients", IEEE Trans. Automatic Control 33, 1988; the system is from
 markov_jump.
 """
 
@@ -66,7 +66,7 @@ class InteractingModels:
 
     Source: H. A. P. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for
     systems with Markovian switching coefficients", IEEE Trans. Automatic Control 33, 1988; the
-    system is that of markov_jump.
+    system is from markov_jump.
     """
 
     plant: MarkovJumpPlant

@@ -62,7 +62,7 @@ class AugmentedModel:
 
     Shapes: ``transition`` Ā (a, a), ``faded`` c_i = β̄_i C_i (l, a), ``unfaded`` C_i (l, a).
 
-    Source: markov_jump, equations (5)-(11); in (9) the variance is that of sensor i, and P_n and
+    Source: markov_jump, equations (5)-(11); in (9) the variance is sensor i's, and P_n and
     π_n of (10) are those at k - 1.
     """
 

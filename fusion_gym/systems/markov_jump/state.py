@@ -80,7 +80,7 @@ OF_FAMILY = (
         "greedy_variance",
         "centre",
         _PER_SENSOR,
-        "that trace if only the sensors before this one in the greedy order transmit",
+        "trace if only the sensors before this one in the greedy order transmit",
         joint=True,
     ),
     Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step"),
@@ -88,8 +88,8 @@ OF_FAMILY = (
 SIGNALS = (
     *common_signals(
         "(sensors, n, N)",
-        measurement="the node's new estimate, which it would send",
-        innovation="that estimate minus the centre's copy",
+        measurement="the node's new estimate",
+        innovation="the node's new estimate minus the centre's copy",
         held="the last delivered estimate",
         expected_measurement="the centre's copy, predicted",
     ),

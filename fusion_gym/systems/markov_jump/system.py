@@ -112,13 +112,13 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             ),
             fused(
                 "log_deviation",
-                "the same of the fused estimate if nobody transmits",
+                "logarithm of the silent fused over the open-loop deviation",
                 lambda s: log_deviation(s.prior_covariance, self.reference),
                 constants=open_loop,
             ),
             fused(
                 "estimate",
-                "that estimate over the state's root mean square",
+                "fused estimate without a transmission over the root mean square",
                 lambda s: s.prior_mean / self.magnitude[:, None],
                 constants={"root mean square": self.magnitude},
             ),
@@ -168,8 +168,8 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         copy_mean = self.filters.predict(state.copy_mean, state.copy_noise, before)
         lags = self.recursion.predict(state.lags, state.sent, before)
         prediction = self.recursion.prediction(lags, place)
-        nobody = np.zeros(state.sent.shape, dtype=np.bool_)
-        silent = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(nobody))
+        silence = np.zeros(state.sent.shape, dtype=np.bool_)
+        silent = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(silence))
         return replace(
             state,
             time=time,
@@ -280,8 +280,8 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
 
     def _variance_reduction(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
         silent = linalg.weighted_trace(state.prior_covariance, self.state_weights)
-        nobody = np.zeros(state.sent.shape, dtype=np.bool_)
-        each = self._covariances_with_one_more(state, prediction, nobody)
+        silence = np.zeros(state.sent.shape, dtype=np.bool_)
+        each = self._covariances_after_next(state, prediction, silence)
         return np.stack(
             [silent - linalg.weighted_trace(covariance, self.state_weights) for covariance in each]
         )
@@ -292,14 +292,14 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         sensors, result = np.arange(self.sensor_count)[:, None], np.empty(sent.shape)
         trace = linalg.trace(state.prior_covariance)
         for _ in range(self.sensor_count):
-            each = self._covariances_with_one_more(state, prediction, sent)
+            each = self._covariances_after_next(state, prediction, sent)
             options = np.where(sent, np.inf, [linalg.trace(covariance) for covariance in each])
             selected = sensors == options.argmin(0)
             result[selected] = np.broadcast_to(trace, sent.shape)[selected]
             trace, sent = options.min(0), sent | selected
         return result
 
-    def _covariances_with_one_more(
+    def _covariances_after_next(
         self, state: MarkovJumpState, prediction: JointPrediction, sent: NDArray[np.bool_]
     ) -> list[Array]:
         """Return fused covariances (n, n, N) if ``sent`` (l, N) and one more sensor transmit."""

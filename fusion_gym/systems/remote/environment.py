@@ -38,6 +38,14 @@ class RemoteEstimationOptions(PaperOptions):
 
     With the defaults the reward is the negative of the literature's cost: the squared error plus
     ``cost_weight`` for each transmission.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.remote.environment import RemoteEstimationOptions
+        >>> options = RemoteEstimationOptions(sensors=2, channel="independent")
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.horizon
+        (2, 200)
     """
 
     sensors: int = 1
@@ -50,7 +58,7 @@ class RemoteEstimationOptions(PaperOptions):
     """Deviation of x(0) about 0: one number, or one per source."""
     channel: Literal["perfect", "independent", "gilbert_elliott"] = "perfect"
     """Model of losses. ``"independent"`` loses every packet with one probability,
-    ``"gilbert_elliott"`` with that of the channel's state."""
+    ``"gilbert_elliott"`` with a probability for each channel state."""
     drop_probability: ArrayLike | None = None
     """Probability of a loss. Independent: one number, or one per sensor, by default 0.2.
     Gilbert-Elliott: the pair (bad, good), by default (0.7, 0.2)."""
@@ -104,7 +112,7 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
         options,
         system,
         weights,
-        nodes_remember=True,  # a source's value is all that there is to know of it
+        nodes_have_memory=True,  # a source's value is all that there is to know of it
         no_estimates="a packet carries the source's value itself",
     )
 

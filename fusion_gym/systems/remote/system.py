@@ -63,8 +63,8 @@ SIGNALS = (
         measurement="the source's value",
         innovation="error without a delivery: value minus prediction",
         innovation_deviation="standard deviation of the innovation by age",
-        prior_covariance="covariance of that prediction by age",
-        variance_reduction="expected fall of that trace if this sensor alone transmits",
+        prior_covariance="covariance of the prediction by age",
+        variance_reduction="expected reduction of this trace by this sensor's packet",
     ),
     Signal(
         "channel_state",

@@ -56,6 +56,14 @@ class BiasedOscillatorOptions(FeedbackOptions):
 
     The defaults are the oscillator of the paper's Section IV.A. The paper does not give, and we
     chose: ``information_shares`` (equal) and the reward.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.tobit.biased import BiasedOscillatorOptions
+        >>> options = BiasedOscillatorOptions(censoring_upper=8.0)
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.access, task.horizon
+        (2, 'single', 100)
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
@@ -116,6 +124,14 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
 
     The defaults are the target of the paper's Section IV.B. The paper does not give, and we chose:
     ``information_shares`` (equal) and the reward.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.tobit.biased import BiasedTrackingOptions
+        >>> options = BiasedTrackingOptions(horizon=50)
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.access, task.horizon
+        (2, 'single', 50)
     """
 
     transition: ArrayLike = ((1.0, _PERIOD), (0.0, 1.0))
@@ -159,14 +175,14 @@ def _build(options: BiasedOscillatorOptions) -> Scenario:
     random = options.random_start
     system = make_system(options, plant, centre, tuple(names), _REFERENCE_HORIZON, model, random)
     weights = equal_weights(system.open_loop(horizon))
-    remembering = memory_filter_system(system, options.memory_filter, _FILTERS, options, sensors)
+    memory_system = memory_filter_system(system, options.memory_filter, _FILTERS, options, sensors)
     return Scenario(
         options,
         system,
         weights,
         stochastic_defaults(options),
         feedback=True,
-        memory_system=remembering,
+        memory_system=memory_system,
     )
 
 

@@ -67,9 +67,7 @@ class Centre(Protocol):
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
-        """Return the posterior mean (n, N) and covariance (n, n, N) after the ``granted``
-        (sensors, N).
-        """
+        """Return mean (n, N) and covariance (n, n, N) after the grants (sensors, N)."""
         ...
 
     def local_means(
@@ -87,17 +85,13 @@ class Centre(Protocol):
     def single(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
-        """Return the posterior means (sensors, n, N) and covariances (sensors, n, n, N) of single
-        grants.
-        """
+        """Return means (sensors, n, N) and covariances (sensors, n, n, N) after single grants."""
         raise RuntimeError(f"{type(self).__name__} is not separable")
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
-        """Return the fused trace (N,) of a silent step, weighted by ``weights`` (n,), and its
-        reductions.
-        """
+        """Return a silent step's weighted fused trace (N,), and its reductions (sensors, N)."""
         ...
 
 

@@ -136,15 +136,14 @@ class Scalar(NamedTuple):
     variance: Array
 
     @classmethod
-    def of(cls, root: Array, row: Array, noise: Array) -> Scalar:
+    def from_row(cls, root: Array, row: Array, noise: Array) -> Scalar:
         """Return the measurement of ``row`` c (…, n, 1) or (…, n, N)."""
         projection = linalg.matvec(linalg.transpose(root), row)
         variance = linalg.dot(projection, projection) + noise
         return cls(root, projection, linalg.matvec(root, projection), noise, variance)
 
     def posterior(self, share: Array | float) -> Array:
-        """Return a root of P - P cᵀ c P s/S, where the measurement explains the share s of its
-        variance.
+        """Return a root of P - P cᵀ c P s/S, s the share of variance that the measurement explains.
 
         It is G (I - w g gᵀ) with (1 - w gᵀ g)² = 1 - s gᵀ g/S, which loses no digits for any P.
         """
@@ -178,7 +177,7 @@ def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
         for channel in range(matrix.shape[-3]):
             row = matrix[..., channel, :, lanes]
             row = np.moveaxis(row, 0, -1)
-            scalar = Scalar.of(root, row, np.ones(1))
+            scalar = Scalar.from_row(root, row, np.ones(1))
             residual = value[..., channel, lanes] - linalg.dot(row, shift)
             shift = shift + scalar.cross * (residual / scalar.variance)[..., None, :]
             root = scalar.posterior(1.0)

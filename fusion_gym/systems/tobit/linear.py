@@ -65,6 +65,15 @@ class LinearFusionOptions(FeedbackOptions):
 
     v2: ``reward_scale`` multiplies the state weights: a moderate policy costs 1 a step by default.
     Its errors scale the entries of beliefs, and the price of a token is 0.5.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.tobit.linear import LinearFusionOptions
+        >>> options = LinearFusionOptions(transition=[[0.9]], process_covariance=[[1.0]],
+        ...     measurement_matrices=[[1.0]])
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.system.state_names
+        (1, ('x1',))
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
@@ -166,7 +175,7 @@ def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
 
 
 def _names(value: Any, states: int) -> tuple[str, ...]:
-    """Return the states' names, by default x1, x2, …"""
+    """Return the states' names, by default x1, x2 and so on."""
     if value is None:
         return tuple(f"x{i + 1}" for i in range(states))
     listed = isinstance(value, (list, tuple)) and len(value) == len(set(map(repr, value))) == states

@@ -69,6 +69,14 @@ class TobitOscillatorOptions(FeedbackOptions):
     ``initial_covariance``, ``information_shares`` (equal), ``horizon``. The text gives x₀ = (5, 0),
     which we use as the mean. Other numbers of sensors repeat the trigger's thresholds
     (0.1, 0.2, 0.3) and decays (0.1, 0.2, 0.1).
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
+        >>> options = TobitOscillatorOptions(filter="tobit", token_rate=2.0)
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.system.state_names
+        (3, ('x1', 'x2'))
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
@@ -134,9 +142,11 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
     trigger = _trigger(options, sensors.count)
     centre = _centre(options, sensors)
     holds = options.filter == "paper" and options.silent != "predict"
-    remembering = options.memory_filter
-    if remembering is None and options.filter == "paper":
-        remembering = "adf"  # the paper's minimises a bound; with every measurement it errs thrice
+    memory_filter = options.memory_filter
+    if memory_filter is None and options.filter == "paper":
+        memory_filter = (
+            "adf"  # the paper's minimises a bound; with every measurement it errs thrice
+        )
     names = tuple(f"x{i + 1}" for i in range(plant.size))
     random = options.random_start
     system = make_system(options, plant, centre, names, horizon, random_start=random)
@@ -146,7 +156,7 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
         system,
         policy_defaults=defaults,
         feedback=True,
-        memory_system=memory_filter_system(system, remembering, _FILTERS, options, sensors),
+        memory_system=memory_filter_system(system, memory_filter, _FILTERS, options, sensors),
         no_estimates=_HELD if holds else None,
     )
 

@@ -61,7 +61,12 @@ _COMPONENTS = "(sensors, m, N)"
 SIGNALS = (
     *common_signals(_COMPONENTS, measurement="the new censored measurement"),
     Signal("censored", "own", _COMPONENTS, "whether the component is at its threshold"),
-    Signal("uncensored_probability", "centre", _COMPONENTS, "predicted, from 0 to 1"),
+    Signal(
+        "uncensored_probability",
+        "centre",
+        _COMPONENTS,
+        "predicted probability of an uncensored component",
+    ),
 )
 
 
@@ -119,7 +124,7 @@ class CensoredSystem(System[CensoredState]):
         """
         if capability == "covariance_cycle":
             return self.centre.predictable
-        if capability == "fused_alone":
+        if capability == "single_deliveries":
             return self.centre.separable
         return super().offers(capability)
 
@@ -130,7 +135,7 @@ class CensoredSystem(System[CensoredState]):
 
     @property
     def observation(self) -> tuple[Block, ...]:
-        """Blocks of the observation, without those of censoring if nothing is censored."""
+        """Blocks of the observation, without the censoring blocks if nothing is censored."""
         sensors, nodes = self.centre.sensors, numbered(self.sensor_count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
         new = partial(own, knowledge="own", limit=_RANGE)
@@ -256,7 +261,7 @@ class CensoredSystem(System[CensoredState]):
         age = np.where(granted, 0.0, state.age)
         return replace(state, held=held, age=age, mean=mean, covariance=covariance)
 
-    def fused_alone(self, state: CensoredState) -> tuple[Array, Array]:
+    def single_deliveries(self, state: CensoredState) -> tuple[Array, Array]:
         """See :class:`System`."""
         return self.centre.single(
             state.prior_mean, state.prior_covariance, sensed(state.prediction), state.measurement

@@ -50,8 +50,8 @@ def censored_moments(sensors: CensoredSensors, latent: Array, deviation: Array) 
 def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array) -> Expectation:
     """Return the moments for thresholds on both sides.
 
-    With probabilities a below, b above and p between, y has mean a τ + b υ + p centre. The variance
-    is, by the law of total variance, that within the interval and that of the three values τ, υ and
+    With probabilities a below, b above and p between, y has mean a τ + b υ + p centre. By the law
+    of total variance, the variance is the one within the interval plus the variance of τ, υ and
     centre. Source: round_robin_tobit, equations (9), (12)-(14), (20).
     """
     low = (sensors.threshold - latent) / deviation
@@ -149,7 +149,7 @@ class AssumedDensityFilter:
     transmissions are not chosen by the noise.
 
     Source: P. S. Maybeck, "Stochastic models, estimation, and control", volume 2, 1982, chapter
-    12, for assumed densities; the moments are those of a truncated normal variable.
+    12, for assumed densities; the moments are a truncated normal variable's.
     """
 
     sensors: CensoredSensors
@@ -182,7 +182,7 @@ class AssumedDensityFilter:
         root = root[None]
         for component in range(self.sensors.size):
             row = matrix[:, component]
-            scalar = Scalar.of(root, row, noise[:, component])
+            scalar = Scalar.from_row(root, row, noise[:, component])
             share, deviation = np.ones_like(scalar.variance), np.sqrt(scalar.variance)
             for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
                 limit = threshold[:, component]
@@ -202,7 +202,7 @@ class AssumedDensityFilter:
         granted: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
         row = self.sensors.measurement_matrix[sensor, component]
-        scalar = Scalar.of(root, row, self.sensors.variance[sensor, component])
+        scalar = Scalar.from_row(root, row, self.sensors.variance[sensor, component])
         latent, deviation = linalg.dot(row, mean), np.sqrt(scalar.variance)
         step = (value - latent) / scalar.variance
         loss = np.ones_like(step)

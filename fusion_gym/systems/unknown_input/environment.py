@@ -66,6 +66,14 @@ class UnknownInputOptions(PaperOptions):
 
     ``None`` stands for the number of the chosen ``example``, which
     :mod:`fusion_gym.systems.unknown_input.examples` lists.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
+        >>> options = UnknownInputOptions(input_signal="steps")
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.system.state_names
+        (3, ('position_1', 'velocity_1', 'position_2', 'velocity_2', 'force'))
     """
 
     filters: ClassVar[Mapping[str, type]] = FILTERS
@@ -141,7 +149,7 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
     plant = _plant(options)
     signal = _signal(options, plant.inputs, horizon)
     sensors = InputSensors.create(
-        _given(options.measurement_matrices), _given(options.measurement_covariance), plant
+        _required(options.measurement_matrices), _required(options.measurement_covariance), plant
     )
     trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
@@ -175,12 +183,12 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
         system,
         weights,
         {"adaptive_threshold": trigger},
-        memory_system=_remembering(options, system, sensors, horizon),
+        memory_system=_with_memory_filter(options, system, sensors, horizon),
         no_estimates="the centre makes its estimate anew from what each node sent",
     )
 
 
-def _remembering(
+def _with_memory_filter(
     options: UnknownInputOptions, system: UnknownInputSystem, sensors: InputSensors, horizon: int
 ) -> UnknownInputSystem | None:
     """Return the system with the filter of ``memory_filter``, or the system's own for ``None``.
@@ -223,17 +231,17 @@ def _with_example(options: UnknownInputOptions) -> UnknownInputOptions:
 def _plant(options: UnknownInputOptions) -> UnknownInputPlant:
     half = options.initial_half_width
     return UnknownInputPlant.create(
-        _given(options.transition),
-        _given(options.input_matrix),
-        _given(options.process_covariance),
+        _required(options.transition),
+        _required(options.input_matrix),
+        _required(options.process_covariance),
         options.sampling_period,
-        _given(options.initial_mean),
-        _given(options.initial_covariance),
+        _required(options.initial_mean),
+        _required(options.initial_covariance),
         half,
     )
 
 
-def _given(value: ArrayLike | None) -> ArrayLike:
+def _required(value: ArrayLike | None) -> ArrayLike:
     """Return a number that the example has filled in."""
     assert value is not None, "the examples give every number"
     return value
@@ -266,12 +274,12 @@ def _nodes(
     options: UnknownInputOptions, plant: UnknownInputPlant, sensors: InputSensors, horizon: int
 ) -> Nodes:
     kind = validation.choice("filter", options.filter, FILTERS)
-    factor = validation.positive("young_factor", _given(options.young_factor), (sensors.count,))
+    factor = validation.positive("young_factor", _required(options.young_factor), (sensors.count,))
     model = InputModel.create(
         plant,
-        _given(options.input_memory),
-        _given(options.input_change),
-        _given(options.input_deviation),
+        _required(options.input_memory),
+        _required(options.input_change),
+        _required(options.input_deviation),
     )
     joint = JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
@@ -283,7 +291,7 @@ def _nodes(
             "belongs to filter='random_walk'"
         )
     if kind == "paper":
-        bound = _given(options.rho_bar)
+        bound = _required(options.rho_bar)
         tables = BoundTables.create(joint, model, bound, factor, horizon)
         return TableNodes.create(model, sensors, tables, fusion)
     if kind == "predict":
@@ -305,7 +313,7 @@ def _trigger(options: UnknownInputOptions, sensors: int) -> dict[str, tuple[floa
     """Return the parameters of the adaptive threshold trigger, one number per sensor."""
     names = ("rho_bar", "rho_initial", "adaptation")
     spread = {
-        name: tuple(validation.spread(name, _given(getattr(options, name)), (sensors,)).tolist())
+        name: tuple(validation.spread(name, _required(getattr(options, name)), (sensors,)).tolist())
         for name in names
     }
     validation.adaptive_thresholds(*spread.values())

@@ -57,7 +57,7 @@ class InputSensors:
         noise = _noise_covariances(covariances, *c.shape[:2])
         inverses, complements = [], []
         for sensor, matrix in enumerate(c):
-            inverse, complement = _seen_input(sensor, matrix, plant)
+            inverse, complement = _observable_input(sensor, matrix, plant)
             inverses.append(inverse)
             complements.append(complement)
         return cls(
@@ -113,7 +113,7 @@ def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
     return variances[..., None] * np.eye(size)
 
 
-def _seen_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> tuple[Array, Array]:
+def _observable_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> tuple[Array, Array]:
     """Return (C ℬ)⁺ and the kernel of (C ℬ)ᵀ, or refuse a C ℬ of deficient rank."""
     inputs = plant.input_matrix[..., 0]
     q, observed = plant.inputs, matrix @ inputs

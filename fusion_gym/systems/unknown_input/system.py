@@ -62,9 +62,9 @@ class UnknownInputState:
 
 SIGNALS = common_signals(
     age="sampling instants since the last delivery",
-    expected_measurement="the node's expectation, its last input estimate carried on",
+    expected_measurement="the node's expectation, with the predicted input",
     prior_mean="prediction of the fused state",
-    prior_covariance="its covariance, as if state and input estimates were uncorrelated",
+    prior_covariance="covariance of the prediction, with zero blocks between state and input",
 )
 
 
@@ -151,7 +151,7 @@ class UnknownInputSystem(System[UnknownInputState]):
             ),
             fused(
                 "log_deviation",
-                "the same of the last fused estimate",
+                "logarithm of the last fused over the open-loop deviation",
                 self._log_deviation,
                 constants=open_loop,
             ),

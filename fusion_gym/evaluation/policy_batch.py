@@ -20,7 +20,7 @@ from fusion_gym.validation import ConfigurationError
 Runs = NDArray[np.int64]
 
 
-class Brief(NamedTuple):
+class EpisodeMeans(NamedTuple):
     """The results of E episodes of a policy, each averaged over an episode's steps.
 
     Args:
@@ -40,7 +40,9 @@ class Brief(NamedTuple):
         return self.error_cost + price * self.tokens
 
 
-def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int) -> list[Brief]:
+def run_policies(
+    task: Task, policies: Sequence[Policy], episodes: int, seed: int
+) -> list[EpisodeMeans]:
     """Run every policy on the seeds ``seed``, ``seed + 1``, … in one batch.
 
     The results equal the results of ``run_episodes`` up to rounding. The time of a step hardly
@@ -81,10 +83,10 @@ def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int)
 
     batch = _batch(task, owners.pop(), seed + np.arange(runs) % episodes)
     brief = _run(batch, requests)
-    return [Brief(*(values[part] for values in brief)) for part in parts]
+    return [EpisodeMeans(*(values[part] for values in brief)) for part in parts]
 
 
-def run_priced(task: Task, policy: Policy, seeds: Runs, prices: Array) -> Brief:
+def run_priced(task: Task, policy: Policy, seeds: Runs, prices: Array) -> EpisodeMeans:
     """Run one policy on N seeds, each at its own price of a token.
 
     The signals and the reward use these prices instead of the price of the task.
@@ -112,7 +114,7 @@ def _batch(task: Task, owner: Owner | None, seeds: Runs) -> EpisodeBatch:
     return batch
 
 
-def _run(batch: EpisodeBatch, requests: Callable[[Signals], Requests]) -> Brief:
+def _run(batch: EpisodeBatch, requests: Callable[[Signals], Requests]) -> EpisodeMeans:
     """Run the first episode of all runs of a batch."""
     sums, horizon = np.zeros((4, batch.num_envs)), batch.task.horizon
     for _ in range(horizon):
@@ -121,7 +123,7 @@ def _run(batch: EpisodeBatch, requests: Callable[[Signals], Requests]) -> Brief:
         step = (outcome.granted.mean(0), squared_error, -outcome.reward_error, outcome.cost)
         for total, values in zip(sums, step, strict=True):
             total += values
-    return Brief(*(sums / horizon))
+    return EpisodeMeans(*(sums / horizon))
 
 
 class _Whole:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.policy_batch import run_policies
 from fusion_gym.policies.registry import make_policy
 
 ENV = "fusion_gym/TobitOscillator-v1"
@@ -29,7 +29,7 @@ def test_policies_beside_each_other_do_what_each_does_alone(
 ) -> None:
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=15, **options)
     built = [make_policy(name, task) for name in policies]
-    for name, brief in zip(policies, run_beside(task, built, 7, 3), strict=True):
+    for name, brief in zip(policies, run_policies(task, built, 7, 3), strict=True):
         single = run_episodes(task, make_policy(name, task), 7, 3)
         np.testing.assert_array_equal(brief.mse, single.mse)
         np.testing.assert_allclose(brief.rate, single.rate.mean(-1), rtol=1e-12)
