@@ -42,7 +42,7 @@ REFERENCE = "rule"
 
 
 @dataclass
-class ClassRecord:
+class Evidence:
     """The results of a class of a setting, by kind of policy and training seed."""
 
     setting: Setting
@@ -100,22 +100,22 @@ class ClassRecord:
         return min(scores, key=scores.__getitem__)
 
 
-def gather(suite: Suite, runner: Runner) -> list[ClassRecord]:
+def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     """Run unfinished work, and return all classes."""
     classes = find_prices(suite, runner)
     find_rules(suite, runner, classes)
     train_agents(suite, runner, classes)
-    jobs = [BoundJob(entry.setting, entry.name, entry.prices) for entry in classes]
-    for entry, bounds in zip(classes, runner.run(run_bound, jobs, "bounds"), strict=True):
-        entry.bounds = bounds
+    jobs = [BoundJob(item.setting, item.name, item.prices) for item in classes]
+    for item, bounds in zip(classes, runner.run(run_bound, jobs, "bounds"), strict=True):
+        item.bounds = bounds
     test_all(suite, runner, classes)
-    test_cases(suite, runner, [entry for entry in classes if entry.name == "scheduler"])
+    test_cases(suite, runner, [item for item in classes if item.name == "scheduler"])
     return classes
 
 
 def find_prices(
     suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASSES
-) -> list[ClassRecord]:
+) -> list[Evidence]:
     """Tune the rules with one threshold, and freeze the prices of the classes."""
 
     def sweep(
@@ -127,87 +127,87 @@ def find_prices(
     places = [(setting, name) for setting in suite.settings for name in names]
     jobs = [sweep(setting, name, setting.has_memory(name)) for setting, name in places]
     results = runner.run(run_sweep, jobs, "single thresholds")
-    classes = [ClassRecord(*place, result) for place, result in zip(places, results, strict=True)]
-    others = [entry for entry in classes if entry.setting.has_memory(entry.name)]
-    jobs = [sweep(entry.setting, entry.name, False, entry.prices) for entry in others]
+    classes = [Evidence(*place, result) for place, result in zip(places, results, strict=True)]
+    others = [item for item in classes if item.setting.has_memory(item.name)]
+    jobs = [sweep(item.setting, item.name, False, item.prices) for item in others]
     results = runner.run(run_sweep, jobs, "single thresholds without memory")
-    for entry, result in zip(others, results, strict=True):
-        entry.memoryless = result
+    for item, result in zip(others, results, strict=True):
+        item.memoryless = result
     return classes
 
 
-def find_rules(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
+def find_rules(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
     """Search one rule for all prices of each class."""
     jobs = [
         SearchJob(
-            entry.setting, entry.name, entry.prices, suite.generations, runner.folder / "searches"
+            item.setting, item.name, item.prices, suite.generations, runner.folder / "searches"
         )
-        for entry in classes
+        for item in classes
     ]
-    for entry, text in zip(classes, runner.run(run_search, jobs, "searches"), strict=True):
-        entry.rule = f"{text},price={{price}}"
+    for item, text in zip(classes, runner.run(run_search, jobs, "searches"), strict=True):
+        item.rule = f"{text},price={{price}}"
 
 
-def train_agents(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
+def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
     """Train one agent per class and seed."""
-    places = [(entry, seed) for entry in classes for seed in range(suite.training_seeds)]
+    places = [(item, seed) for item in classes for seed in range(suite.training_seeds)]
     jobs = []
-    for entry, seed in places:
-        folder = runner.folder / "agents" / f"{entry.setting.name}_{entry.name}_{seed}"
-        experiment = suite.experiment(entry.setting, entry.name, entry.prices, seed)
-        jobs.append(TrainingJob(entry.setting, entry.name, experiment, folder))
+    for item, seed in places:
+        folder = runner.folder / "agents" / f"{item.setting.name}_{item.name}_{seed}"
+        experiment = suite.experiment(item.setting, item.name, item.prices, seed)
+        jobs.append(TrainingJob(item.setting, item.name, experiment, folder))
     runner.run(run_training, jobs, "trainings")
-    for (entry, _), job in zip(places, jobs, strict=True):
-        entry.models.append(job.model)
+    for (item, _), job in zip(places, jobs, strict=True):
+        item.models.append(job.model)
 
 
-def test_all(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
+def test_all(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
     """Test every kind of policy on the test episodes, and rules and agents in validation."""
-    places: list[tuple[ClassRecord, str, bool]] = []
+    places: list[tuple[Evidence, str, bool]] = []
     jobs: list[TestJob] = []
-    for entry in classes:
-        for kind, policies in policies_of(entry):
-            places.append((entry, kind, True))
-            jobs.append(entry.test(policies, suite.episodes))
+    for item in classes:
+        for kind, policies in policies_of(item):
+            places.append((item, kind, True))
+            jobs.append(item.test(policies, suite.episodes))
             if kind in (REFERENCE, "agent"):
-                places.append((entry, kind, False))
-                jobs.append(entry.test(policies, suite.validation_episodes, VALIDATION_SEED))
-    for (entry, kind, final), outcomes in zip(
+                places.append((item, kind, False))
+                jobs.append(item.test(policies, suite.validation_episodes, VALIDATION_SEED))
+    for (item, kind, final), outcomes in zip(
         places, runner.run(run_test, jobs, "tests"), strict=True
     ):
-        tests = entry.tests if final else entry.validations
+        tests = item.tests if final else item.validations
         tests.setdefault(kind, []).append(outcomes)
 
 
-def policies_of(entry: ClassRecord) -> Iterator[tuple[str, list[str]]]:
+def policies_of(item: Evidence) -> Iterator[tuple[str, list[str]]]:
     """Yield the kinds of policy of a class, each with one policy per price."""
-    count = len(entry.prices)
-    yield REFERENCE, [entry.rule] * count
-    yield "threshold", [entry.sweep.best(price).policy for price in entry.prices]
-    trigger = entry.setting.trigger.policy
-    if any(tuned.rule == trigger for tuned in entry.sweep.tuned):
-        yield "trigger", [entry.sweep.best(price, trigger).policy for price in entry.prices]
-    if entry.setting.optimum is not None and entry.name == "scheduler":
-        yield "optimum", [entry.setting.optimum] * count
-    for model in entry.models:
+    count = len(item.prices)
+    yield REFERENCE, [item.rule] * count
+    yield "threshold", [item.sweep.best(price).policy for price in item.prices]
+    trigger = item.setting.trigger.policy
+    if any(tuned.rule == trigger for tuned in item.sweep.tuned):
+        yield "trigger", [item.sweep.best(price, trigger).policy for price in item.prices]
+    if item.setting.optimum is not None and item.name == "scheduler":
+        yield "optimum", [item.setting.optimum] * count
+    for model in item.models:
         yield "agent", [f"model:{model},price={{price}}"] * count
 
 
-def test_cases(suite: Suite, runner: Runner, classes: Sequence[ClassRecord]) -> None:
+def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
     """Test the rule, and the agent with the least validation cost, in every perturbed case."""
-    places: list[tuple[ClassRecord, str]] = []
+    places: list[tuple[Evidence, str]] = []
     jobs: list[TestJob] = []
-    for entry in classes:
-        agent = f"model:{entry.models[entry.best_agent]},price={{price}}"
-        prices = entry.prices[1:4]  # the middle ones
-        for case in (None, *suite.cases_of(entry.setting)):
-            places.append((entry, "as assumed" if case is None else case.name))
-            for text in (entry.rule, agent):
+    for item in classes:
+        agent = f"model:{item.models[item.best_agent]},price={{price}}"
+        prices = item.prices[1:4]  # the middle ones
+        for case in (None, *suite.cases_of(item.setting)):
+            places.append((item, "as assumed" if case is None else case.name))
+            for text in (item.rule, agent):
                 policies = [text] * len(prices)
-                jobs.append(entry.test(policies, suite.case_episodes, case=case, prices=prices))
+                jobs.append(item.test(policies, suite.case_episodes, case=case, prices=prices))
     results = runner.run(run_test, jobs, "perturbed cases")
-    for place, (entry, name) in enumerate(places):
-        entry.cases[name] = results[2 * place], results[2 * place + 1]
+    for place, (item, name) in enumerate(places):
+        item.cases[name] = results[2 * place], results[2 * place + 1]
 
 
 def check_policy(suite: Suite, text: str, name: ClassName) -> None:
@@ -224,16 +224,16 @@ def check_policy(suite: Suite, text: str, name: ClassName) -> None:
             )
 
 
-def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) -> list[ClassRecord]:
+def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) -> list[Evidence]:
     """Test a policy in a class of every setting, together with the searched rule."""
     classes = find_prices(suite, runner, (name,))
     find_rules(suite, runner, classes)
-    kinds = {REFERENCE: [entry.rule for entry in classes], "policy": [text] * len(classes)}
+    kinds = {REFERENCE: [item.rule for item in classes], "policy": [text] * len(classes)}
     test_texts(suite, runner, classes, kinds)
     return classes
 
 
-def search_again(suite: Suite, runner: Runner) -> list[ClassRecord]:
+def search_again(suite: Suite, runner: Runner) -> list[Evidence]:
     """Search three random classes with four times the generations and other episodes."""
     classes = find_prices(suite, runner)
     find_rules(suite, runner, classes)
@@ -248,107 +248,105 @@ def search_again(suite: Suite, runner: Runner) -> list[ClassRecord]:
     ]
     texts = [f"{text},price={{price}}" for text in runner.run(run_search, jobs, "second searches")]
     test_texts(
-        suite, runner, classes, {REFERENCE: [entry.rule for entry in classes], "second": texts}
+        suite, runner, classes, {REFERENCE: [item.rule for item in classes], "second": texts}
     )
     return classes
 
 
 def test_texts(
-    suite: Suite, runner: Runner, classes: Sequence[ClassRecord], kinds: dict[str, list[str]]
+    suite: Suite, runner: Runner, classes: Sequence[Evidence], kinds: dict[str, list[str]]
 ) -> None:
     """Test one policy of every kind for each class, at all prices."""
     for kind, texts in kinds.items():
         jobs = [
-            entry.test([text] * len(entry.prices), suite.episodes)
-            for entry, text in zip(classes, texts, strict=True)
+            item.test([text] * len(item.prices), suite.episodes)
+            for item, text in zip(classes, texts, strict=True)
         ]
-        for entry, outcomes in zip(classes, runner.run(run_test, jobs, kind), strict=True):
-            entry.tests[kind] = [outcomes]
+        for item, outcomes in zip(classes, runner.run(run_test, jobs, kind), strict=True):
+            item.tests[kind] = [outcomes]
 
 
-def policy_rows(suite: Suite, classes: Sequence[ClassRecord]) -> list[TestRow]:
+def policy_rows(suite: Suite, classes: Sequence[Evidence]) -> list[TestRow]:
     """Return a row for every policy at every price."""
     return [
         TestRow(
-            entry.setting.name, entry.name, kind, seed, share, o.price, float(o.cost.mean()),
+            item.setting.name, item.name, kind, seed, share, o.price, float(o.cost.mean()),
             float(o.error.mean()), float(o.tokens.mean()), o.mse, o.rate,
             "" if kind == "agent" else o.policy,
         )
-        for entry in classes
-        for kind, every in entry.tests.items()
+        for item in classes
+        for kind, every in item.tests.items()
         for seed, outcomes in enumerate(every)
         for share, o in zip(suite.shares, outcomes, strict=True)
     ]  # fmt: skip
 
 
-def point_rows(suite: Suite, classes: Sequence[ClassRecord]) -> list[PointRow]:
+def point_rows(suite: Suite, classes: Sequence[Evidence]) -> list[PointRow]:
     """Return the difference to the searched rule at every price."""
-    places: list[tuple[ClassRecord, str, float, float]] = []
+    places: list[tuple[Evidence, str, float, float]] = []
     results: list[Difference] = []
-    for entry in classes:
-        reference = entry.tests[REFERENCE][0]
-        for kind, every in entry.tests.items():
+    for item in classes:
+        reference = item.tests[REFERENCE][0]
+        for kind, every in item.tests.items():
             if kind == REFERENCE:
                 continue
-            for place, price in enumerate(entry.prices):
+            for place, price in enumerate(item.prices):
                 costs = [outcomes[place].cost for outcomes in every]
-                places.append((entry, kind, suite.shares[place], price))
+                places.append((item, kind, suite.shares[place], price))
                 results.append(cost_difference(costs, reference[place].cost))
     counts = discoveries([item.p for item in results])
     return [
-        PointRow(entry.setting.name, entry.name, kind, share, price, d.mean, d.low, d.high, counted)
-        for (entry, kind, share, price), d, counted in zip(places, results, counts, strict=True)
+        PointRow(item.setting.name, item.name, kind, share, price, d.mean, d.low, d.high, counted)
+        for (item, kind, share, price), d, counted in zip(places, results, counts, strict=True)
     ]
 
 
-def class_rows(classes: Sequence[ClassRecord]) -> list[ClassRow]:
+def class_rows(classes: Sequence[Evidence]) -> list[ClassRow]:
     """Return the mean difference to the searched rule over a class's prices.
 
     The proven bound is a kind of its own, without an interval.
     """
     rows = [
-        ClassRow(entry.setting.name, entry.name, kind, d.mean, d.low, d.high)
-        for entry in classes
-        for kind, every in entry.tests.items()
+        ClassRow(item.setting.name, item.name, kind, d.mean, d.low, d.high)
+        for item in classes
+        for kind, every in item.tests.items()
         if kind != REFERENCE
-        for d in [over_prices(every, entry.tests[REFERENCE][0])]
+        for d in [over_prices(every, item.tests[REFERENCE][0])]
     ]
-    for entry in classes:
-        if entry.bounds:
-            costs = [float(outcome.cost.mean()) for outcome in entry.tests[REFERENCE][0]]
-            below = float(np.mean(np.divide(entry.bounds, costs))) - 1.0
-            rows.append(ClassRow(entry.setting.name, entry.name, "bound", below, below, below))
+    for item in classes:
+        if item.bounds:
+            costs = [float(outcome.cost.mean()) for outcome in item.tests[REFERENCE][0]]
+            below = float(np.mean(np.divide(item.bounds, costs))) - 1.0
+            rows.append(ClassRow(item.setting.name, item.name, "bound", below, below, below))
     return rows
 
 
-def choice_rows(classes: Sequence[ClassRecord]) -> list[ChoiceRow]:
+def choice_rows(classes: Sequence[Evidence]) -> list[ChoiceRow]:
     """Return the policy of each class with the least validation cost, and the effect of memory."""
     rows = []
-    for entry in classes:
-        kind, seed = entry.choice
-        d = over_prices([entry.tests[kind][seed]], entry.tests[REFERENCE][0])
+    for item in classes:
+        kind, seed = item.choice
+        d = over_prices([item.tests[kind][seed]], item.tests[REFERENCE][0])
         memory = float("nan")
-        if entry.memoryless is not None:
+        if item.memoryless is not None:
             costs = [
-                entry.memoryless.best(price).cost / entry.sweep.best(price).cost
-                for price in entry.prices
+                item.memoryless.best(price).cost / item.sweep.best(price).cost
+                for price in item.prices
             ]
             memory = float(np.mean(costs)) - 1.0
         rows.append(
-            ChoiceRow(
-                entry.setting.name, entry.name, kind, d.mean, d.low, d.high, memory, entry.rule
-            )
+            ChoiceRow(item.setting.name, item.name, kind, d.mean, d.low, d.high, memory, item.rule)
         )
     return rows
 
 
-def case_rows(classes: Sequence[ClassRecord]) -> list[CaseRow]:
+def case_rows(classes: Sequence[Evidence]) -> list[CaseRow]:
     """Return the costs of every scheduler's rule and agent in the perturbed cases."""
     rows = []
-    for entry in classes:
-        for case, (rule, agent) in entry.cases.items():
-            base = entry.cases["as assumed"][0]
+    for item in classes:
+        for case, (rule, agent) in item.cases.items():
+            base = item.cases["as assumed"][0]
             d = over_prices([agent], rule)
             change = over_prices([rule], base).mean
-            rows.append(CaseRow(entry.setting.name, case, change, d.mean, d.low, d.high))
+            rows.append(CaseRow(item.setting.name, case, change, d.mean, d.low, d.high))
     return rows

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from rich.table import Table
 
 from agents.benchmark.evidence import (
-    ClassRecord,
+    Evidence,
     case_rows,
     choice_rows,
     class_rows,
@@ -47,20 +47,20 @@ LINES = {  # kind: label, colour, marker
 }
 
 
-def write_results(suite: Suite, classes: Sequence[ClassRecord], folder: Path) -> None:
+def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> None:
     """Write all tables, a figure per setting, the page, and README's table."""
     folder.mkdir(parents=True, exist_ok=True)
     policies, points = policy_rows(suite, classes), point_rows(suite, classes)
     means, choices = class_rows(classes), choice_rows(classes)
-    cases = case_rows([entry for entry in classes if entry.name == "scheduler"])
+    cases = case_rows([item for item in classes if item.name == "scheduler"])
     for rows in (policies, points, means, choices, cases):
         write_rows(folder, rows)
     for setting in suite.settings:
         own = [row for row in policies if row.setting == setting.name]
         draw_setting(own, setting.title, folder / f"{setting.name}.png")
-    for entry in classes:
-        if (entry.setting.name, entry.name) == HEADLINE:
-            draw_headline(policies, entry, folder / "readme.png")
+    for item in classes:
+        if (item.setting.name, item.name) == HEADLINE:
+            draw_headline(policies, item, folder / "readme.png")
     titles = {setting.name: setting.title for setting in suite.settings}
     headline = headline_text(titles, means)
     page = [
@@ -188,19 +188,19 @@ def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
     save_figure(figure, path)
 
 
-def draw_headline(rows: Sequence[TestRow], entry: ClassRecord, path: Path) -> None:
+def draw_headline(rows: Sequence[TestRow], item: Evidence, path: Path) -> None:
     """Draw one class and its proven bound: error >= max over prices of (bound - price · tokens)."""
     plt.rcParams.update(READABLE)
     figure, panel = plt.subplots(figsize=(7.0, 4.4))
     draw_class(
-        panel, [row for row in rows if (row.setting, row.name) == (entry.setting.name, entry.name)]
+        panel, [row for row in rows if (row.setting, row.name) == (item.setting.name, item.name)]
     )
-    if entry.bounds:
+    if item.bounds:
         label, colour, _ = LINES["bound"]
         tokens = np.geomspace(*panel.get_xlim(), 200)
-        errors = np.max(np.array(entry.bounds) - np.multiply.outer(tokens, entry.prices), axis=1)
+        errors = np.max(np.array(item.bounds) - np.multiply.outer(tokens, item.prices), axis=1)
         panel.plot(tokens[errors > 0], errors[errors > 0], "--", color=colour, label=label)
-    panel.set(ylabel=ERROR, title=f"{entry.setting.title}, {TITLES[entry.name]}")
+    panel.set(ylabel=ERROR, title=f"{item.setting.title}, {TITLES[item.name]}")
     panel.legend()
     figure.tight_layout()
     save_figure(figure, path)

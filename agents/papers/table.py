@@ -2,7 +2,7 @@
 
     python -m agents.papers.table --config configs/tobit_oscillator_reproduce.yaml
 
-Every row runs on the same seeds. ``--markdown`` prints Markdown.
+Every row runs on the same seeds.
 """
 
 from dataclasses import dataclass
@@ -36,18 +36,13 @@ class Table(Long):
     """Episodes of each row."""
     seed: Seed = 0
     """Seed of the first episode."""
-    markdown: bool = False
-    """Print the table as the documentation holds it."""
 
     keeps = False
 
     def run(self) -> None:
         """Run every row and print the table."""
-        rows = _rows_of(load_checked(SweepSettings, self.config), self.episodes, self.seed)
-        if self.markdown:
-            return print(table(COLUMNS, rows))
-        title = f"{self.episodes} episodes, seed {self.seed}"
-        tables.console().print(tables.table_tables(title, COLUMNS, rows))
+        settings = load_checked(SweepSettings, self.config)
+        print(table(COLUMNS, _rows_of(settings, self.episodes, self.seed)))
 
 
 def _rows_of(comparison: SweepSettings, episodes: int, seed: int) -> list[tuple[str, ...]]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from agents.benchmark.evidence import ClassRecord, gather
+from agents.benchmark.evidence import Evidence, gather
 from agents.benchmark.jobs import Runner
 from agents.benchmark.settings import TEST_SEED, Suite, knowledge_of, load_suite
 from agents.workers import Pool
@@ -44,15 +44,13 @@ class Zoo(Long):
         """Write the agents, and remove the others."""
         suite, work = load_suite(settings=self.settings), (self.work / "full").absolute()
         classes = {
-            f"{entry.setting.name}_{entry.name}": entry
-            for entry in gather(suite, Runner(work, Pool(self.workers)))
+            f"{item.setting.name}_{item.name}": item
+            for item in gather(suite, Runner(work, Pool(self.workers)))
         }
-        models = {
-            name: small_model(entry.models[entry.best_agent]) for name, entry in classes.items()
-        }
+        models = {name: small_model(item.models[item.best_agent]) for name, item in classes.items()}
         writing((f"{len(models)} agents with their cards", self.zoo))
-        for name, entry in classes.items():
-            write(self.zoo / f"{name}.json", agent_card(suite, entry, models[name]))
+        for name, item in classes.items():
+            write(self.zoo / f"{name}.json", agent_card(suite, item, models[name]))
             with replacing(self.zoo / f"{name}.zip") as partial:
                 partial.write_bytes(models[name])
             print(f"zoo:{name}")
@@ -60,25 +58,25 @@ class Zoo(Long):
             print(f"zoo:{name} is removed")
 
 
-def agent_card(suite: Suite, entry: ClassRecord, model: bytes) -> dict[str, Any]:
+def agent_card(suite: Suite, item: Evidence, model: bytes) -> dict[str, Any]:
     """Return the content of an agent's JSON."""
-    seed = entry.best_agent
-    experiment = suite.experiment(entry.setting, entry.name, entry.prices, seed)
+    seed = item.best_agent
+    experiment = suite.experiment(item.setting, item.name, item.prices, seed)
     options = dict(experiment.environment.options)
     for name in ("cost_weight", "price_range"):
         options.pop(name)
     return {
         "sha256": hashlib.sha256(model).hexdigest(),
-        "env": entry.setting.environment,
+        "env": item.setting.environment,
         "options": options,
-        "class": entry.name,
-        "knows": knowledge_of(entry.setting, entry.name),
+        "class": item.name,
+        "knows": knowledge_of(item.setting, item.name),
         "training": experiment.model_dump(mode="json", exclude={"output"}),
-        "command": f"python -m agents.zoo --settings {entry.setting.name}, training seed {seed}",
+        "command": f"python -m agents.zoo --settings {item.setting.name}, training seed {seed}",
         "test": {
             "episodes": suite.episodes,
             "seed": TEST_SEED,
-            "prices": list(entry.prices),
+            "prices": list(item.prices),
             "points": [
                 {
                     "cost": float(outcome.cost.mean()),
@@ -87,7 +85,7 @@ def agent_card(suite: Suite, entry: ClassRecord, model: bytes) -> dict[str, Any]
                     "mse": outcome.mse,
                     "rate": outcome.rate,
                 }
-                for outcome in entry.tests["agent"][seed]
+                for outcome in item.tests["agent"][seed]
             ],
         },
     }

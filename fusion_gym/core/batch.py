@@ -64,7 +64,7 @@ class EpisodeBatch(Runs):
         self._shared = (
             reference is not None and memory.keeps_every and reference is task.memory_system
         )
-        self._reference_state: Any = None  # the reference's state, after sensing
+        self._full_state: Any = None  # the reference's state, after sensing
         self.tokens = task.bucket.start(num_envs)
         self.queue = task.bucket.start_queue(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))
@@ -134,9 +134,7 @@ class EpisodeBatch(Runs):
         self.memory.begin(first, fresh, row, runs, self.num_envs)
         if self.reference is not None and not self._shared:
             beside = self.reference.sense(self.reference.start(first), row)
-            self._reference_state = (
-                beside if everyone else merge_runs(self._reference_state, beside, runs)
-            )
+            self._full_state = beside if everyone else merge_runs(self._full_state, beside, runs)
         fresh = system.sense(fresh, row)
         self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
         self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
@@ -169,7 +167,7 @@ class EpisodeBatch(Runs):
             self._draw(np.arange(self.num_envs))
         self.sense(self.normals())
         if self.reference is not None and not self._shared:
-            self._reference_state = self.reference.sense(self._reference_state, self.noise())
+            self._full_state = self.reference.sense(self._full_state, self.noise())
         self.finished = outcome.ended.copy()
         return outcome
 
@@ -209,7 +207,7 @@ class EpisodeBatch(Runs):
             beside = self.memory.states.every
         else:
             everyone = np.ones((self.task.sensors, self.num_envs), dtype=np.bool_)
-            self._reference_state = beside = arrived(system, self._reference_state, everyone)
+            self._full_state = beside = arrived(system, self._full_state, everyone)
         self.reference_error = system.truth(beside) - system.fused_mean(beside)
 
     def _lottery(self) -> Array | None:

@@ -66,12 +66,9 @@ class CovarianceIntersection(FusionRule):
         fused = np.take_along_axis(own, first[None, None, None], 0)[0]
         weights = (np.arange(len(means))[:, None] == first) * 1.0
         lanes = np.flatnonzero(active.sum(0) != 1)
-        metric = None if basis is None else _select_lanes(basis, lanes)
+        metric = None if basis is None else _at(basis, lanes)
         part = covariance_intersection_many(
-            _select_lanes(means, lanes),
-            _select_lanes(own, lanes),
-            _select_lanes(active, lanes),
-            metric,
+            _at(means, lanes), _at(own, lanes), _at(active, lanes), metric
         )
         mean[:, lanes], fused[..., lanes] = part.mean, part.covariance
         weights[:, lanes] = part.weights
@@ -127,18 +124,16 @@ def covariance_intersection_many(
     lanes = np.flatnonzero(pairs)
     if lanes.size:
         weights[:, lanes], fused[..., lanes] = best_of_pair(
-            _select_lanes(covariances, lanes),
-            _select_lanes(selected, lanes),
-            _select_lanes(metric, lanes),
+            _at(covariances, lanes), _at(selected, lanes), _at(metric, lanes)
         )
     lanes = np.flatnonzero(open_lanes & ~pairs)
     if lanes.size:
-        taking_part = _select_lanes(selected, lanes)
-        start = taking_part / np.abs(_select_lanes(linalg.trace(covariances), lanes))
+        taking_part = _at(selected, lanes)
+        start = taking_part / np.abs(_at(linalg.trace(covariances), lanes))
         np.copyto(start, 0.0, where=~taking_part)
         start /= sum_rows(start)
         weights[:, lanes], fused[..., lanes] = _search(
-            _select_lanes(information, lanes), _select_lanes(metric, lanes), start
+            _at(information, lanes), _at(metric, lanes), start
         )
     vector = np.zeros_like(means[0])
     for weight, item, mean, takes_part in zip(weights, information, means, selected, strict=True):
@@ -146,11 +141,11 @@ def covariance_intersection_many(
     joined = linalg.matvec(fused, vector)
     lanes = np.flatnonzero(singular)
     if lanes.size:
-        own, taking_part = _select_lanes(covariances, lanes), _select_lanes(selected, lanes)
+        own, taking_part = _at(covariances, lanes), _at(selected, lanes)
         part, weights[:, lanes], fused[..., lanes] = _constrained(
-            own, taking_part, _select_lanes(metric, lanes)
+            own, taking_part, _at(metric, lanes)
         )
-        known = np.where(taking_part[:, None], _select_lanes(means, lanes), 0.0)
+        known = np.where(taking_part[:, None], _at(means, lanes), 0.0)
         joined[:, lanes] = sum_rows(linalg.matvec(part, known))
 
     def gains() -> Array:
@@ -210,13 +205,11 @@ def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
     information = np.zeros_like(covariances)
     for estimate, takes_part in enumerate(selected):
         lanes = np.flatnonzero(takes_part)
-        information[estimate][..., lanes] = linalg.inverse(
-            _select_lanes(covariances[estimate], lanes)
-        )
+        information[estimate][..., lanes] = linalg.inverse(_at(covariances[estimate], lanes))
     return information
 
 
-def _select_lanes(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
+def _at(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
     """Return the given runs with a contiguous batch axis."""
     return array.take(lanes, axis=-1)
 
@@ -288,22 +281,14 @@ def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Arra
         open_lanes = worse | (gain.max(0) - total > _GAP * total)
         if not open_lanes.all():
             closed, still = np.flatnonzero(~open_lanes), np.flatnonzero(open_lanes)
-            weights[:, lanes[closed]] = _select_lanes(new, closed)
-            fused[..., lanes[closed]] = _select_lanes(covariance, closed)
+            weights[:, lanes[closed]] = _at(new, closed)
+            fused[..., lanes[closed]] = _at(covariance, closed)
             if not still.size:
                 return weights, fused
-            lanes, information, worse = (
-                lanes[still],
-                _select_lanes(information, still),
-                worse[still],
-            )
-            root, spread, gain = (
-                _select_lanes(root, still),
-                _select_lanes(spread, still),
-                _select_lanes(gain, still),
-            )
-            basis = _select_lanes(basis, still)
-            old, new = _select_lanes(old, still), _select_lanes(new, still)
+            lanes, information, worse = (lanes[still], _at(information, still), worse[still])
+            root, spread, gain = (_at(root, still), _at(spread, still), _at(gain, still))
+            basis = _at(basis, still)
+            old, new = _at(old, still), _at(new, still)
             total, lowest = total[still], lowest[still]
         target = _newton(information, new, root, spread, gain, total)
         target = np.where(worse, 0.5 * (old + new), target)
@@ -373,11 +358,9 @@ def _newton(
     for _ in range(len(weights) - 1):
         if not lanes.size:
             break
-        reached[:, lanes], blocking = _as_far(
-            _select_lanes(reached, lanes), _select_lanes(target, lanes)
-        )
-        mask = _select_lanes(free, lanes) & ~blocking
-        trial = _model_minimum(_select_lanes(curvature, lanes), _select_lanes(gain, lanes), mask)
+        reached[:, lanes], blocking = _as_far(_at(reached, lanes), _at(target, lanes))
+        mask = _at(free, lanes) & ~blocking
+        trial = _model_minimum(_at(curvature, lanes), _at(gain, lanes), mask)
         free[:, lanes], target[:, lanes] = mask, trial
         lanes = lanes[(trial < 0.0).any(0)]
     target /= sum_rows(target)
@@ -385,9 +368,7 @@ def _newton(
     unsound = np.flatnonzero(~sound)
     if unsound.size:
         target[:, unsound] = _exchange(
-            _select_lanes(weights, unsound),
-            _select_lanes(gain, unsound),
-            _select_lanes(curvature, unsound),
+            _at(weights, unsound), _at(gain, unsound), _at(curvature, unsound)
         )
     return target
 

@@ -23,11 +23,8 @@ from rich.table import Column
 from rich.text import Text
 
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
-_EVERY, _SHARE, _MOST = (
-    20.0,
-    0.1,
-    600.0,
-)  # seconds between two lines; share of the elapsed time; most seconds
+# Seconds between two lines, at most, and their share of the elapsed time.
+_EVERY, _MOST, _SHARE = 20.0, 600.0, 0.1
 
 
 class Bar:

@@ -61,12 +61,7 @@ _COMPONENTS = "(sensors, m, N)"
 SIGNALS = (
     *common_signals(_COMPONENTS, measurement="the new censored measurement"),
     Signal("censored", "own", _COMPONENTS, "whether the component is at its threshold"),
-    Signal(
-        "uncensored_probability",
-        "centre",
-        _COMPONENTS,
-        "predicted probability of an uncensored component",
-    ),
+    Signal("uncensored_probability", "centre", _COMPONENTS, "predicted P(uncensored)"),
 )
 
 
