@@ -86,7 +86,7 @@ class LinearPlant(Plant):
             initial_covariance: covariance of x(0) (n, n), positive semi-definite.
 
         Raises:
-            ConfigurationError: a wrong shape, a non-finite entry, or no covariance.
+            ConfigurationError: a wrong shape, a non-finite entry, or no valid covariance.
         """
         matrix = validation.square("transition", transition)
         size = len(matrix)

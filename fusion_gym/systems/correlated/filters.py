@@ -2,12 +2,6 @@
 
 Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
 based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
-
-Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
-based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
-
-Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
-based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
 """
 
 from __future__ import annotations

@@ -2,9 +2,6 @@
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements), its plant and sensors; the centre is ours.
-
-Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
-systems with correlated noises and fading measurements), its plant and sensors; the centre is ours.
 """
 
 from __future__ import annotations

@@ -5,9 +5,6 @@ the measurements, and the prediction of measurements.
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements), for all sensors at once.
-
-Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
-systems with correlated noises and fading measurements), for all sensors at once.
 """
 
 from __future__ import annotations

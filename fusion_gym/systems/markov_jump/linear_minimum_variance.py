@@ -4,9 +4,6 @@ Gains and covariances do not depend on the measurements: they are tables over ti
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
-
-Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
-systems with correlated noises and fading measurements).
 """
 
 from __future__ import annotations

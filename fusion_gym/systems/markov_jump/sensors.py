@@ -2,9 +2,6 @@
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
-
-Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
-systems with correlated noises and fading measurements).
 """
 
 from __future__ import annotations

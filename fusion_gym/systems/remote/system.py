@@ -2,12 +2,6 @@
 
 Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with Markovian
 state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
-
-Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with Markovian
-state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
-
-Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
-Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 """
 
 from collections.abc import Callable, Mapping

@@ -3,10 +3,6 @@
 Source: tobit_token_bucket, Theorems 1 and 2. Simulation confirms four corrections, which
 docs/tobit_oscillator.md describes: (29) starts from the previous posterior; K_{t+1} in (30) is K_t;
 C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter updates with the held value.
-
-Source: tobit_token_bucket, Theorems 1 and 2. Four readings, each checked by simulation and
-described in docs/tobit_oscillator.md: (29) starts from the previous posterior; K_{t+1} in (30) is
-K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter really updates with the held value.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """The joint input-state filter that holds the last measurement, with a bound of its covariance.
 
 Source: unknown_input, equations (8)-(20), in a form whose bound holds.
-
-Source: unknown_input, equations (8)-(20), in a form whose bound holds.
 """
 
 from __future__ import annotations

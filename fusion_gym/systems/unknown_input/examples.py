@@ -3,10 +3,6 @@
 Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023),
 Section 4.
-
-Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
-cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023),
-Section 4.
 """
 
 from typing import Any

@@ -4,8 +4,6 @@ State and input are fused separately, each by (24) with weights of the smallest 
 cross-covariance of the two results is unknown and set to zero.
 
 Source: unknown_input, equations (24)-(26).
-
-Source: unknown_input, equations (24)-(26).
 """
 
 from __future__ import annotations

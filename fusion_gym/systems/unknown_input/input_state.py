@@ -7,11 +7,6 @@ Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023); S.
 Gillijns and B. De Moor, "Unbiased minimum-variance input and state estimation for linear
 discrete-time systems", Automatica 43, 2007.
-
-Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
-cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023);
-S. Gillijns and B. De Moor, "Unbiased minimum-variance input and state estimation for linear
-discrete-time systems", Automatica 43, 2007.
 """
 
 from __future__ import annotations

@@ -4,8 +4,6 @@
 node and run. Nodes get no feedback.
 
 Source: unknown_input, equations (8), (24), (25).
-
-Source: unknown_input, equations (8), (24), (25).
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Linear sensors of the state, each with its own noise covariance.
 
 Source: unknown_input, equation (2).
-
-Source: unknown_input, equation (2).
 """
 
 from __future__ import annotations

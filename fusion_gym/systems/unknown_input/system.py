@@ -2,9 +2,6 @@
 
 Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
-
-Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
-cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
 """
 
 import functools
