@@ -23,7 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import erfcx, ndtr
+
+from fusion_gym.namespace import as_array, erfcx, in_lanes, namespace, ndtr
 
 FloatArray = NDArray[np.float64]
 
@@ -68,46 +69,44 @@ class IntervalMoments(NamedTuple):
     variance: FloatArray
 
 
-def _far_tail(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return excess and variance beyond z from the continued fraction, for z at least `_FAR`."""
+def _far_tail(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return hazard, excess and variance beyond z of at least `_FAR`, by the continued fraction."""
     remainder = _TERMS / z
     for k in range(_TERMS - 1, 1, -1):
         remainder = k / (z + remainder)
     excess = 1.0 / (z + remainder)
-    return excess, excess * (remainder - excess)
+    return z + excess, excess, excess * (remainder - excess)
 
 
 def _tail(z: FloatArray, scaled: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return hazard, excess and variance beyond z from scaled = erfcx(z / sqrt 2)."""
-    hazard_ = np.asarray(_HAZARD_SCALE / scaled)
-    excess = np.asarray(hazard_ - z)
-    variance = np.asarray(1.0 - hazard_ * np.minimum(excess, 1e300))
-    far = z > _FAR
-    if far.any():
-        z_far = z[far]
-        excess[far], variance[far] = _far_tail(z_far)
-        hazard_[far] = z_far + excess[far]
-    return hazard_, excess, variance
+    xp = namespace(z, scaled)
+    hazard_ = xp.asarray(_HAZARD_SCALE / scaled)
+    excess = xp.asarray(hazard_ - z)
+    variance = xp.asarray(1.0 - hazard_ * xp.minimum(excess, 1e300))
+    results = in_lanes(z > _FAR, _far_tail, (z,), (hazard_, excess, variance), (_FAR + 1.0,))
+    return results[0], results[1], results[2]
 
 
 @np.errstate(all="ignore")
 def _beyond(z: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return hazard, excess and variance beyond z."""
-    z = np.asarray(z, dtype=np.float64)
-    return _tail(z, erfcx(_ROOT_HALF * z))
+    values = as_array(z)
+    return _tail(values, erfcx(_ROOT_HALF * values))
 
 
 @np.errstate(all="ignore")
 def density(z: ArrayLike) -> FloatArray:
     """Return the standard normal density ``phi(z) = exp(-z^2 / 2) / sqrt(2 pi)``."""
-    z = np.asarray(z, dtype=np.float64)
-    return _DENSITY_SCALE * np.exp(-0.5 * z * z)
+    values = as_array(z)
+    result: FloatArray = _DENSITY_SCALE * namespace(values).exp(-0.5 * values * values)
+    return result
 
 
 @np.errstate(all="ignore")
 def upper_tail(z: ArrayLike) -> FloatArray:
     """Return the probability ``Q(z) = 1 - Phi(z)`` of exceeding z, accurate in the tail."""
-    return ndtr(-np.asarray(z, dtype=np.float64))
+    return ndtr(-as_array(z))
 
 
 def hazard(z: ArrayLike) -> FloatArray:
@@ -128,14 +127,15 @@ def tobit_moments(z: ArrayLike) -> TobitMoments:
         z: ``(threshold - predicted measurement) / standard deviation``. Minus infinity stands
             for no threshold: probability 1, hazard 0, infinite excess, variance 1.
     """
-    z = np.asarray(z, dtype=np.float64)
-    return TobitMoments(ndtr(-z), *_tail(z, erfcx(_ROOT_HALF * z)))
+    values = as_array(z)
+    return TobitMoments(ndtr(-values), *_tail(values, erfcx(_ROOT_HALF * values)))
 
 
 def _truncate(near: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Replace ends beyond which the probability is zero by finite ones."""
-    near = np.maximum(near, -_OUTER)
-    return near, np.minimum(width, _OUTER - np.minimum(near, 0.0))
+    xp = namespace(near, width)
+    near = xp.maximum(near, -_OUTER)
+    return near, xp.minimum(width, _OUTER - xp.minimum(near, 0.0))
 
 
 def _inside(
@@ -151,34 +151,39 @@ def _inside(
         near: Near end, finite; the midpoint is not below zero.
         width: Width of the interval, finite.
     """
-    far = near + width
-    ends = np.stack(np.broadcast_arrays(near, far))
+    xp, far = namespace(near, width), near + width
+    ends = xp.stack(xp.broadcast_arrays(near, far))
     scaled = erfcx(_ROOT_HALF * ends)
     hazards, excesses, variances = _tail(ends, scaled)
     drop = 0.5 * width * (near + far)
-    rho = scaled[1] / scaled[0] * np.exp(-drop)
+    rho = scaled[1] / scaled[0] * xp.exp(-drop)
     share = 1.0 - rho
-    rise = -np.expm1(-drop)
-    probability = np.asarray(ndtr(-near) * share)
-    mean = np.asarray(hazards[0] * rise / share)
-    offset = np.asarray((excesses[0] - rho * (excesses[1] + width)) / share)
+    rise = -xp.expm1(-drop)
+    offset = xp.asarray((excesses[0] - rho * (excesses[1] + width)) / share)
     gap = width + excesses[1] - offset
-    variance = np.asarray((variances[0] - rho * variances[1]) / share - rho * gap * gap)
-
+    results = (
+        xp.asarray(ndtr(-near) * share),
+        offset,
+        xp.asarray(hazards[0] * rise / share),
+        xp.asarray((variances[0] - rho * variances[1]) / share - rho * gap * gap),
+    )
     narrow = width * (1.0 + 0.5 * (near + far)) < _NARROW
-    if narrow.any():
-        # The nodes lie on the last axis, so that every element has the same order of summation.
-        start, span = near[narrow], width[narrow]
-        step = span[:, None] * _NODES
-        values = _WEIGHTS * np.exp(-step * (start[:, None] + 0.5 * step))
-        mass = values.sum(axis=-1)
-        centre = (values * _NODES).sum(axis=-1) / mass
-        deviation = _NODES - centre[:, None]
-        probability[narrow] = density(start) * span * mass
-        offset[narrow] = span * centre
-        mean[narrow] = rise[narrow] / (span * mass)
-        variance[narrow] = span * span * (values * deviation * deviation).sum(axis=-1) / mass
-    return probability, offset, mean, variance
+    inside = in_lanes(narrow, _quadrature, (near, width, rise), results, (0.0, 1.0, 1.0))
+    return inside[0], inside[1], inside[2], inside[3]
+
+
+def _quadrature(
+    start: FloatArray, span: FloatArray, rise: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the results of :func:`_inside` for narrow intervals (k,)."""
+    # The nodes lie on the last axis, so that every element has the same order of summation.
+    step = span[:, None] * _NODES
+    values = _WEIGHTS * namespace(start, span).exp(-step * (start[:, None] + 0.5 * step))
+    mass = values.sum(axis=-1)
+    centre = (values * _NODES).sum(axis=-1) / mass
+    deviation = _NODES - centre[:, None]
+    variance = span * span * (values * deviation * deviation).sum(axis=-1) / mass
+    return density(start) * span * mass, span * centre, rise / (span * mass), variance
 
 
 @np.errstate(all="ignore")
@@ -196,15 +201,15 @@ def interval_moments(low: ArrayLike, high: ArrayLike) -> IntervalMoments:
     Raises:
         ValueError: `low` is not below `high` somewhere, or one of them is NaN.
     """
-    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    ordered = low < high
-    if not ordered.all():
-        lows, highs = np.broadcast_arrays(low, high)
+    lower, upper = as_array(low), as_array(high)
+    xp, ordered = namespace(lower, upper), lower < upper
+    if xp is np and not ordered.all():
+        lows, highs = np.broadcast_arrays(lower, upper)
         first = np.unravel_index(int(np.argmin(ordered)), ordered.shape)
         raise ValueError(
             f"low = {lows[first]} and high = {highs[first]} are not allowed: low must be below high"
         )
-    flip = low + high < 0.0
-    near, width = _truncate(np.where(flip, -high, low), high - low)
+    flip = lower + upper < 0.0
+    near, width = _truncate(xp.where(flip, -upper, lower), upper - lower)
     probability, _, mean, variance = _inside(near, width)
-    return IntervalMoments(probability, np.where(flip, -mean, mean), variance)
+    return IntervalMoments(probability, xp.where(flip, -mean, mean), variance)

@@ -4,8 +4,8 @@ A quantity of shape S for N runs is an array of shape ``(*S, N)``: a matrix is
 ``(..., n, m, N)`` and a vector ``(..., n, N)``. Leading axes (for example sensors) and a
 batch axis of length 1 broadcast as in NumPy, so a constant matrix has the shape ``(n, m, 1)``.
 
-Every routine is a short sequence of element-wise NumPy operations along the two small axes; BLAS
-and LAPACK compute products and inverses of large matrices, run by run. The floating-point
+Every routine is a short sequence of element-wise operations of NumPy or JAX along the two small
+axes. NumPy's large matrices use BLAS and LAPACK, run by run. The floating-point
 operations of a run do not depend on the number of runs, so its result is bitwise the same in every
 batch.
 
@@ -18,16 +18,20 @@ not positive definite is NaN; other runs are unaffected, and there is no error a
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpstrf
+
+from fusion_gym.namespace import namespace, set_at, update_at
 
 FloatArray = NDArray[np.float64]
 _MANY = 8  # rows from which on a test for a diagonal matrix saves time
 _LARGE = 16  # rows from which on BLAS and LAPACK are faster than element-wise operations
 _ROUNDING = 2e-15  # relative rounding error of a difference of variances, per row
 _CHUNK = 32  # runs per transposition, which then stays in the cache
+_ALL = slice(None)
 
 
 def identity(size: int) -> FloatArray:
@@ -65,7 +69,7 @@ def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
     """Return ``a + diag(d)`` of ``(..., n, n, N)`` and d broadcastable to ``(..., n, N)``."""
     result = a.copy()
     for k in range(a.shape[-2]):
-        result[..., k, k, :] += d[..., k, :]
+        result = update_at(np.add, result, (k, k, _ALL), d[..., k, :])
     return result
 
 
@@ -98,7 +102,7 @@ def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """
     length = a.shape[-2]
     _require_equal_lengths("matmul", length, b.shape[-3])
-    if min(a.shape[-3], length, b.shape[-2]) >= _LARGE:
+    if min(a.shape[-3], length, b.shape[-2]) >= _LARGE and namespace(a, b) is np:
         return _by_lane(np.matmul, a, b)
     result: FloatArray = a[..., 0:1, :] * b[..., 0:1, :, :]
     for k in range(1, length):
@@ -134,7 +138,7 @@ def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
     """Return the product ``a v``, ``(..., n, N)``, of ``(..., n, k, N)`` and ``(..., k, N)``."""
     length = a.shape[-2]
     _require_equal_lengths("matvec", length, v.shape[-2])
-    if min(a.shape[-3], length) >= _LARGE:
+    if min(a.shape[-3], length) >= _LARGE and namespace(a, v) is np:
         return _by_lane(np.matmul, a, v[..., None, :])[..., 0, :]
     result: FloatArray = a[..., 0, :] * v[..., 0:1, :]
     for k in range(1, length):
@@ -187,7 +191,7 @@ def gram(f: FloatArray) -> FloatArray:
 
 def _inverse_root(x: FloatArray) -> FloatArray:
     """Return ``1 / sqrt(x)`` for positive x and NaN for zero, negative or infinite x."""
-    root: FloatArray = np.sqrt(x)
+    root: FloatArray = namespace(x).sqrt(x)
     root /= x
     return root
 
@@ -217,33 +221,37 @@ def _equilibrate(a: FloatArray) -> tuple[FloatArray, FloatArray]:
     return correlation, scale
 
 
-def _eliminate(work: FloatArray, right: FloatArray | None) -> FloatArray:
-    """Factorise in place by Cholesky's method, with an optional forward substitution.
+def _eliminate(work: FloatArray, right: Any) -> tuple[FloatArray, Any, FloatArray]:
+    """Factorise by Cholesky's method, with an optional forward substitution.
 
-    The lower triangle of `work` becomes the factor L, with 1 / L_kk on its diagonal, and `right`
-    becomes L^-1 `right`. A pivot that is not positive makes its own column and every later one NaN.
+    A pivot that is not positive makes its own column and every later one NaN. NumPy's arrays are
+    changed in place.
 
     Args:
         work: ``(..., n, n, N)``.
         right: ``(..., n, m, N)`` or ``None``.
 
     Returns:
-        The last inverse pivot ``(..., N)``, which is NaN exactly where the factorisation fails.
+        The factor L in the lower triangle with 1 / L_kk on its diagonal, L^-1 `right`, and the
+        last inverse pivot ``(..., N)``, which is NaN exactly where the factorisation fails.
     """
     size = work.shape[-2]
     for k in range(size):
-        inverse_pivot = _inverse_root(work[..., k, k, :])
-        work[..., k, k, :] = inverse_pivot
+        inverse_pivot, below = _inverse_root(work[..., k, k, :]), slice(k + 1, None)
+        work = set_at(work, (k, k, _ALL), inverse_pivot)
         if right is not None:
-            right[..., k, :, :] *= inverse_pivot[..., None, :]
+            scale = inverse_pivot[..., None, :]
+            right = update_at(np.multiply, right, (k, _ALL, _ALL), scale)
         if k + 1 == size:
             break
+        work = update_at(np.multiply, work, (below, k, _ALL), inverse_pivot[..., None, :])
         column = work[..., k + 1 :, k, :]
-        column *= inverse_pivot[..., None, :]
-        work[..., k + 1 :, k + 1 :, :] -= column[..., :, None, :] * column[..., None, :, :]
+        square = column[..., :, None, :] * column[..., None, :, :]
+        work = update_at(np.subtract, work, (below, below, _ALL), square)
         if right is not None:
-            right[..., k + 1 :, :, :] -= column[..., :, None, :] * right[..., k : k + 1, :, :]
-    return inverse_pivot
+            product = column[..., :, None, :] * right[..., k : k + 1, :, :]
+            right = update_at(np.subtract, right, (below, _ALL, _ALL), product)
+    return work, right, inverse_pivot
 
 
 @np.errstate(all="ignore")
@@ -257,15 +265,16 @@ def cholesky(a: FloatArray) -> FloatArray:
         ``(..., n, n, N)`` with a positive diagonal and zeros above it, all NaN in a run whose
         matrix is not positive definite.
     """
-    work, scale = _equilibrate(a)
-    last = _eliminate(work, None)
+    correlation, scale = _equilibrate(a)
+    work, _, last = _eliminate(correlation, None)
     poison = last * 0.0
-    factor = np.empty_like(work)
+    factor = namespace(work).empty_like(work)
     for i in range(work.shape[-2]):
-        factor[..., i, i + 1 :, :] = poison[..., None, :]
-        factor[..., i, :i, :] = work[..., i, :i, :] / scale[..., i : i + 1, :]
-        factor[..., i, :i, :] += poison[..., None, :]
-        factor[..., i, i, :] = 1.0 / (work[..., i, i, :] * scale[..., i, :]) + poison
+        left = work[..., i, :i, :] / scale[..., i : i + 1, :] + poison[..., None, :]
+        pivot = 1.0 / (work[..., i, i, :] * scale[..., i, :]) + poison
+        factor = set_at(factor, (i, slice(i + 1, None), _ALL), poison[..., None, :])
+        factor = set_at(factor, (i, slice(i), _ALL), left)
+        factor = set_at(factor, (i, i, _ALL), pivot)
     return factor
 
 
@@ -273,9 +282,7 @@ def cholesky(a: FloatArray) -> FloatArray:
 def whiten(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return ``L^-1 b`` (..., n, m, N) with L the Cholesky factor of `a`."""
     work, scale = _equilibrate(a)
-    x: FloatArray = b * scale[..., :, None, :]
-    _eliminate(work, x)
-    return x
+    return _eliminate(work, b * scale[..., :, None, :])[1]
 
 
 @np.errstate(all="ignore")
@@ -288,33 +295,32 @@ def root(a: FloatArray) -> FloatArray:
     Args:
         a: ``(..., n, n, N)``, symmetric positive semi-definite.
     """
-    size = a.shape[-2]
-    scale = np.sqrt(np.maximum(diagonal(a), 0.0))
+    xp, size = namespace(a), a.shape[-2]
+    scale = xp.sqrt(xp.maximum(diagonal(a), 0.0))
     if size == 1:
         return scale[..., None, :]
-    unit = np.where(scale == 0.0, 0.0, 1.0 / scale)
-    result = np.zeros_like(a)
+    unit = xp.where(scale == 0.0, 0.0, 1.0 / scale)
+    result = xp.zeros_like(a)
     if size == 2:
         correlation = unit[..., 1, :] * a[..., 1, 0, :] * unit[..., 0, :]
-        correlation = np.minimum(np.maximum(correlation, -1.0), 1.0)
+        correlation = xp.minimum(xp.maximum(correlation, -1.0), 1.0)
         left = (1.0 - correlation) * (1.0 + correlation)
-        left[left <= size * _ROUNDING] = 0.0
-        result[..., 0, 0, :] = scale[..., 0, :]
-        result[..., 1, 0, :] = scale[..., 1, :] * correlation
-        result[..., 1, 1, :] = scale[..., 1, :] * np.sqrt(left)
-        return result
+        left = xp.where(left <= size * _ROUNDING, 0.0, left)
+        result = set_at(result, (0, 0, _ALL), scale[..., 0, :])
+        result = set_at(result, (1, 0, _ALL), scale[..., 1, :] * correlation)
+        return set_at(result, (1, 1, _ALL), scale[..., 1, :] * xp.sqrt(left))
     rest = unit[..., :, None, :] * a * unit[..., None, :, :]
     for k in range(size):  # exact, so that rounding does not decide the first pivot
-        rest[..., k, k, :] = np.where(scale[..., k, :] == 0.0, 0.0, 1.0)
-    if size >= _LARGE:
+        rest = set_at(rest, (k, k, _ALL), xp.where(scale[..., k, :] == 0.0, 0.0, 1.0))
+    if size >= _LARGE and xp is np:
         return scale[..., :, None, :] * _by_lane(_root_of_stack, rest)
     for k in range(size):
         left = diagonal(rest)
         first = left.argmax(-2)[..., None, :]
-        pivot = np.take_along_axis(left, first, -2)
-        column = np.take_along_axis(rest, first[..., None, :, :], -3)[..., 0, :, :]
-        column = np.where(pivot <= size * _ROUNDING, 0.0, column / np.sqrt(pivot))
-        result[..., k, :] = scale * column
+        pivot = xp.take_along_axis(left, first, -2)
+        column = xp.take_along_axis(rest, first[..., None, :, :], -3)[..., 0, :, :]
+        column = xp.where(pivot <= size * _ROUNDING, 0.0, column / xp.sqrt(pivot))
+        result = set_at(result, (_ALL, k, _ALL), scale * column)
         rest -= outer(column, column)
     return result
 
@@ -352,25 +358,24 @@ def solve(a: FloatArray, b: FloatArray) -> FloatArray:
     Raises:
         ValueError: The sizes of `a` and `b` differ.
     """
-    size = a.shape[-2]
+    xp, size = namespace(a, b), a.shape[-2]
     _require_equal_lengths("solve", size, b.shape[-3])
     x: FloatArray
     if size == 1:
-        return b / np.where(a > 0.0, a, np.nan)
+        return b / xp.where(a > 0.0, a, np.nan)
     if size == 2:
         correlation, weight = _pair_scales(a)
         scaled = b * weight[..., :, None, :]
-        x = correlation[..., None, None, :] * scaled[..., ::-1, :, :]
-        np.subtract(scaled, x, out=x)
+        x = scaled - correlation[..., None, None, :] * scaled[..., ::-1, :, :]
         x *= weight[..., :, None, :]
         return x
     work, scale = _equilibrate(a)
-    x = b * scale[..., :, None, :]
-    _eliminate(work, x)
+    work, x, _ = _eliminate(work, b * scale[..., :, None, :])
     for k in range(size - 1, -1, -1):
-        x[..., k, :, :] *= work[..., k, k, None, :]
+        x = update_at(np.multiply, x, (k, _ALL, _ALL), work[..., k, k, None, :])
         if k:
-            x[..., :k, :, :] -= work[..., k, :k, None, :] * x[..., k : k + 1, :, :]
+            product = work[..., k, :k, None, :] * x[..., k : k + 1, :, :]
+            x = update_at(np.subtract, x, (slice(k), _ALL, _ALL), product)
     x *= scale[..., :, None, :]
     return x
 
@@ -390,7 +395,8 @@ def solve_vector(a: FloatArray, v: FloatArray) -> FloatArray:
     Raises:
         ValueError: The sizes of `a` and `v` differ.
     """
-    if a.shape[-2] >= _MANY and np.count_nonzero(a) == np.count_nonzero(diagonal(a)):
+    many = a.shape[-2] >= _MANY and namespace(a, v) is np
+    if many and np.count_nonzero(a) == np.count_nonzero(diagonal(a)):
         return _solve_diagonal(diagonal(a), v)
     return solve(a, v[..., None, :])[..., 0, :]
 
@@ -418,32 +424,31 @@ def inverse(a: FloatArray) -> FloatArray:
     Returns:
         The inverse, all NaN in a run where `a` is not positive definite.
     """
-    size = a.shape[-2]
+    xp, size = namespace(a), a.shape[-2]
     if size == 1:
-        return 1.0 / np.where(a > 0.0, a, np.nan)
+        return 1.0 / xp.where(a > 0.0, a, np.nan)
     if size == 2:
         correlation, weight = _pair_scales(a)
         result = outer(weight, weight)
-        off_diagonal = result[..., 0, 1, :]
-        off_diagonal *= -correlation
-        result[..., 1, 0, :] = off_diagonal
-        return result
+        result = update_at(np.multiply, result, (0, 1, _ALL), -correlation)
+        return set_at(result, (1, 0, _ALL), result[..., 0, 1, :])
     work, scale = _equilibrate(a)
-    if size >= _LARGE:
+    if size >= _LARGE and xp is np:
         return _by_lane(_inverse_of_stack, work) * outer(scale, scale)
     # Rows from n on become the upper triangular diag(scale) L^-T.
-    stack = np.zeros((*a.shape[:-3], 2 * size, size, a.shape[-1]))
-    stack[..., :size, :, :] = work
+    stack = xp.zeros((*a.shape[:-3], 2 * size, size, a.shape[-1]))
+    stack = set_at(stack, (slice(size), _ALL, _ALL), work)
     for k in range(size):
-        stack[..., size + k, k, :] = scale[..., k, :]
-        column = stack[..., k + 1 : size + k + 1, k, :]
-        column *= _inverse_root(stack[..., k, k, :])[..., None, :]
+        rows, pivot = slice(k + 1, size + k + 1), _inverse_root(stack[..., k, k, :])
+        stack = set_at(stack, (size + k, k, _ALL), scale[..., k, :])
+        stack = update_at(np.multiply, stack, (rows, k, _ALL), pivot[..., None, :])
         if k + 1 < size:
-            multiplier = column[..., None, : size - k - 1, :]
-            stack[..., k + 1 : size + k + 1, k + 1 :, :] -= column[..., :, None, :] * multiplier
+            column = stack[..., rows, k, :]
+            product = column[..., :, None, :] * column[..., None, : size - k - 1, :]
+            stack = update_at(np.subtract, stack, (rows, slice(k + 1, None), _ALL), product)
     column = stack[..., size:, size - 1, :]
     result = outer(column, column)
     for k in range(size - 1):
-        column = stack[..., size : size + k + 1, k, :]
-        result[..., : k + 1, : k + 1, :] += outer(column, column)
+        column, corner = stack[..., size : size + k + 1, k, :], slice(k + 1)
+        result = update_at(np.add, result, (corner, corner, _ALL), outer(column, column))
     return result

@@ -4,10 +4,10 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import AccessRule
+from fusion_gym.namespace import namespace, ndtr
 
 ACCESS_RULES: tuple[str, ...] = get_args(AccessRule)
 
@@ -29,7 +29,7 @@ def access_mask(
         turn = step % sensors
     elif rule == "random":
         assert noise is not None, "random access needs noise"
-        turn = np.minimum((ndtr(noise) * sensors).astype(np.int64), sensors - 1)
+        turn = namespace(noise).minimum((ndtr(noise) * sensors).astype(np.int64), sensors - 1)
     else:
         return np.ones((sensors, len(step)), dtype=np.bool_)
     return np.arange(sensors)[:, None] == turn
@@ -37,5 +37,5 @@ def access_mask(
 
 def first_request(requests: NDArray[np.bool_], place: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return at most one of the requests (sensors, N), from the sensor with the lowest place."""
-    waiting = np.where(requests, place, len(requests))
+    waiting = namespace(requests, place).where(requests, place, len(requests))
     return requests & (waiting == waiting.min(0))

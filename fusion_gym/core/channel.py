@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace, ndtr
 from fusion_gym.validation import ConfigurationError
 
 STATES = ("bad", "good")  # of a Gilbert-Elliott channel, in the order of its matrices
@@ -103,7 +103,7 @@ class Channel:
 
     def advance(self, state: NDArray[np.int64], noise: Array) -> NDArray[np.int64]:
         """Return S(t), shape (sensors, N), from S(t-1) and standard normals (sensors, N)."""
-        return _choose(self.transition.T[:, state], noise)
+        return _choose(namespace(state).asarray(self.transition.T)[:, state], noise)
 
     def lost(self, state: NDArray[np.int64], noise: Array) -> NDArray[np.bool_]:
         """Return whether a packet sent in this state is lost, drawn for every sensor and step.
@@ -113,14 +113,14 @@ class Channel:
             noise: Standard normals (sensors, N), used whether or not a packet is sent.
         """
         sensor = np.arange(len(state))[:, None]
-        return ndtr(noise) < self.drop[state, sensor]
+        return ndtr(noise) < namespace(state).asarray(self.drop)[state, sensor]
 
 
 def _choose(probability: Array, noise: Array) -> NDArray[np.int64]:
     """Draw from probabilities (states, sensors, N) with one normal each."""
-    uniform = ndtr(noise)
-    result = np.zeros(noise.shape, dtype=np.int64)
-    reached = np.zeros(noise.shape)
+    xp, uniform = namespace(probability, noise), ndtr(noise)
+    result = xp.zeros(noise.shape, dtype=np.int64)
+    reached = xp.zeros(noise.shape)
     for share in probability[:-1]:
         reached = reached + share
         result += uniform >= reached

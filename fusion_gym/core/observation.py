@@ -15,6 +15,7 @@ from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Block, Knowledge, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Queue
+from fusion_gym.namespace import namespace
 from fusion_gym.validation import ConfigurationError
 
 # Odd functions of the beliefs: they resolve small differences and do not saturate.
@@ -216,11 +217,11 @@ class ObservationLayout:
         filled = [block.fill(state) for block in self._own]
         filled += [block.fill(beliefs()) for block in self._memory]
         filled += [block.fill(network) for block in self._network]
-        rows = np.concatenate(filled, dtype=np.float64)
+        xp = namespace(*filled)
+        rows = xp.concatenate([xp.asarray(part, dtype=np.float64) for part in filled])
         with np.errstate(over="ignore"):  # an overflow exceeds every bound
-            result = np.ascontiguousarray(rows.T, dtype=np.float32)
-        np.maximum(result, self.low, out=result)
-        return np.minimum(result, self.high, out=result)
+            result = xp.asarray(rows.T, dtype=np.float32, **({"order": "C"} if xp is np else {}))
+        return xp.minimum(xp.maximum(result, self.low), self.high)
 
     def replace_beliefs(
         self, observation: NDArray[np.float32], beliefs: Beliefs

@@ -14,6 +14,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import ErrorKind
 from fusion_gym.importing import import_named, name_of
+from fusion_gym.namespace import namespace
 from fusion_gym.validation import ConfigurationError
 
 Cost = Callable[[Array, Array], Any]  # of errors (n, N) and covariances (n, n, N)
@@ -161,11 +162,11 @@ class Reward:
 
     def _error_cost(self, error: Array, covariance: Array) -> Array:
         if self.error == "squared":
-            return np.asarray((self.state_weights * (error * error)).sum(0))
+            return (self.state_weights * (error * error)).sum(0)
         if self.error == "trace":
-            return np.asarray((self.state_weights * linalg.diagonal(covariance)).sum(0))
+            return (self.state_weights * linalg.diagonal(covariance)).sum(0)
         if self.error == "maximum":
-            return np.asarray((self.state_weights * (error * error)).max(0))
+            return (self.state_weights * (error * error)).max(0)
         assert not isinstance(self.error, str)
         return _own_cost(self.error, self.error_kind, error, covariance)
 
@@ -246,7 +247,7 @@ class Price:
         if self.span is None:
             raise ConfigurationError("price_range = None is not allowed here: no price is observed")
         low, high = self.span
-        return np.log(price / low) / math.log(high / low)
+        return namespace(price).log(price / low) / math.log(high / low)
 
     def scale(self, price: Array, exponent: float) -> Array:
         """Return (geometric mean of the range / price)^exponent, or 1 without a range.

@@ -18,6 +18,7 @@ from fusion_gym.core.observation import NetworkState, ObservationLayout
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants, Queue
+from fusion_gym.namespace import namespace
 
 
 class Outcome(NamedTuple):
@@ -123,7 +124,9 @@ class Runs:
             granted=granted,
             error=error,
             squared_error=squared_error,
-            diverged=np.asarray(~(squared_error <= task.divergence_level).all(0)),
+            diverged=namespace(squared_error)
+            .logical_not(squared_error <= task.divergence_level)
+            .any(0),
             ended=self.steps >= self._limit,
         )
 
@@ -199,7 +202,7 @@ class Runs:
 
     def grantable(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) whose single request the network would grant now."""
-        return np.asarray(self.admitted() & self.task.bucket.affordable(self.tokens))
+        return self.admitted() & self.task.bucket.affordable(self.tokens)
 
     def signals(self) -> Signals:
         """Return the signals of all runs, except those that the information mode withholds.

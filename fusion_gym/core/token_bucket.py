@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import SharingRule
+from fusion_gym.namespace import gather, namespace, permute
 from fusion_gym.validation import ConfigurationError
 
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
@@ -138,7 +139,7 @@ class TokenBucket:
     def affordable(self, tokens: Array) -> NDArray[np.bool_]:
         """Return whether tokens (N,) pay for a single request of each sensor (sensors, N)."""
         share = len(self.cost) if self.sharing == "equal" else 1
-        return np.asarray((self.cost * share <= tokens + _ROUNDING) | self.unlimited)
+        return (self.cost * share <= tokens + _ROUNDING) | self.unlimited
 
     def grant(
         self,
@@ -157,6 +158,7 @@ class TokenBucket:
 
         Source: tobit_token_bucket, equations (16)-(18).
         """
+        xp = namespace(tokens, requests)
         queue = self.start_queue(len(tokens)) if queue is None else queue
         if self.unlimited:
             granted = requests.copy()
@@ -167,31 +169,31 @@ class TokenBucket:
         else:
             granted = self._grant_in_order(tokens, requests, step)
         paid = granted * self.cost  # np.sum reorders 8 or more terms if N is 1
-        spent = paid.sum(0) if len(paid) < 8 else np.cumsum(paid, axis=0)[-1]
+        spent = paid.sum(0) if len(paid) < 8 else xp.cumsum(paid, axis=0)[-1]
         if not self.unlimited:
-            tokens = np.minimum(np.maximum(tokens + self.rate - spent, 0.0), self.capacity)
+            tokens = xp.minimum(xp.maximum(tokens + self.rate - spent, 0.0), self.capacity)
         return Grants(granted, spent, tokens, move_to_end(queue, granted))
 
     def _grant_by_queue(
         self, tokens: Array, requests: NDArray[np.bool_], queue: Queue
     ) -> NDArray[np.bool_]:
         """Grant each request if the tokens pay for it and all requests ahead in the queue."""
-        place, total = queue * len(tokens) + np.arange(len(tokens)), np.empty(requests.shape)
-        total.reshape(-1)[place] = requests * self.cost
-        return requests & (np.cumsum(total, axis=0) <= tokens + _ROUNDING).take(place)
+        xp = namespace(tokens, requests, queue)
+        total = xp.cumsum(permute(requests * self.cost, queue), axis=0)
+        return requests & gather(total <= tokens + _ROUNDING, queue)
 
     def _grant_in_order(
         self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
         """Grant affordable requests in the order of the sensors, from the first of this step."""
-        runs, granted, left = np.arange(len(tokens)), np.zeros_like(requests), tokens + _ROUNDING
-        first = step if self.sharing == "rotating" else np.zeros_like(step)
-        for place in range(len(requests)):
-            sensor = (place + first) % len(requests)
-            cost = self.cost[sensor, 0]
-            granted[sensor, runs] = answer = requests[sensor, runs] & (cost <= left)
-            left = left - answer * cost
-        return granted
+        xp, count, left = namespace(tokens, requests), len(requests), tokens + _ROUNDING
+        first = step if self.sharing == "rotating" else 0 * step
+        order = (np.arange(count)[:, None] + first) % count
+        cost, answers = xp.asarray(self.cost)[order, 0], []
+        for request, price in zip(gather(requests, order), cost, strict=True):
+            answers.append(request & (price <= left))
+            left = left - answers[-1] * price
+        return permute(xp.stack(answers), order)
 
 
 def move_to_end(queue: Queue, granted: NDArray[np.bool_]) -> Queue:
@@ -200,5 +202,6 @@ def move_to_end(queue: Queue, granted: NDArray[np.bool_]) -> Queue:
         return queue
     key = queue + len(queue) * granted
     if len(queue) > _FEW:
-        return np.argsort(np.argsort(key, axis=0), axis=0)
+        xp = namespace(key)
+        return xp.argsort(xp.argsort(key, axis=0), axis=0)
     return (key[:, None] > key).sum(1)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace
 
 Active = NDArray[np.bool_] | None  # (l, N), the active estimates; all by default
 
@@ -127,8 +128,9 @@ class InformationFusion(FusionRule):
         """Return the fused active estimates, NaN where a covariance is not definite."""
         information = linalg.inverse(own_covariances(covariance))
         if active is not None:
-            information = np.where(active[:, None, None], information, 0.0)
-            means = np.where(active[:, None], means, 0.0)
+            xp = namespace(active, information)
+            information = xp.where(active[:, None, None], information, 0.0)
+            means = xp.where(active[:, None], means, 0.0)
         fused = linalg.inverse(information.sum(0))
         mean = linalg.matvec(fused, linalg.matvec(information, means).sum(0))
         return Fused(mean, fused, lambda: linalg.matmul(fused, information))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
+from fusion_gym.namespace import in_runs
 
 _CANCELLED = 1e-3  # of what is summed; what is left has lost three digits
 
@@ -134,11 +135,13 @@ class LinearPlant(Plant):
             return linalg.matvec(self.transition, mean), prior
         most = (self._cancelling * linalg.diagonal(covariance)[..., None, :, :]).sum(-2)
         cancelled = linalg.diagonal(prior) < most
-        if cancelled.any():
-            lanes = np.flatnonzero(cancelled.reshape(-1, cancelled.shape[-1]).any(0))
-            moved = linalg.matmul(self.transition, linalg.root(covariance[..., lanes]))
-            prior[..., lanes] = linalg.gram(moved) + self.process_covariance
+        runs = cancelled.reshape(-1, cancelled.shape[-1]).any(0)
+        (prior,) = in_runs(runs, self._predict_root, (covariance,), (prior,))
         return linalg.matvec(self.transition, mean), prior
+
+    def _predict_root(self, covariance: Array) -> tuple[Array]:
+        moved = linalg.matmul(self.transition, linalg.root(covariance))
+        return (linalg.gram(moved) + self.process_covariance,)
 
     @functools.cached_property
     def _known_start(self) -> bool:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import STATES, Channel
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_motion, true_noise
@@ -22,6 +23,7 @@ from fusion_gym.core.system import (
     common_signals,
     numbered,
 )
+from fusion_gym.namespace import namespace
 
 _RANGE = 5.0  # scaled errors are clipped here
 _FLOOR = 1e-12  # variance after a delivery, in process variances: zero could not be inverted
@@ -184,14 +186,14 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         self, state: RemoteEstimationState, granted: NDArray[np.bool_]
     ) -> RemoteEstimationState:
         """Replace the centre's prediction where a granted packet arrives."""
-        arrived = granted & ~state.lost
+        xp, arrived = namespace(granted, state.lost), granted & ~state.lost
         floor = _FLOOR * self.deviation[:, None] ** 2
         return replace(
             state,
-            estimate=np.where(arrived, state.truth, state.prior),
-            variance=np.where(arrived, floor, state.prior_variance),
-            held=np.where(arrived, state.truth, state.held),
-            age=np.where(arrived, 0.0, state.age),
+            estimate=xp.where(arrived, state.truth, state.prior),
+            variance=xp.where(arrived, floor, state.prior_variance),
+            held=xp.where(arrived, state.truth, state.held),
+            age=xp.where(arrived, 0.0, state.age),
         )
 
     def read(
@@ -204,7 +206,9 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
             "held": state.held[:, None],
             "age": state.age,
             "expected_measurement": state.prior[:, None],
-            "innovation_deviation": lambda: np.sqrt(state.prior_variance)[:, None],
+            "innovation_deviation": lambda: namespace(state.prior_variance).sqrt(
+                state.prior_variance
+            )[:, None],
             "channel_state": state.channel,
             "prior_mean": state.prior,
             "prior_covariance": lambda: _diagonal(state.prior_variance),
@@ -288,13 +292,10 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
     def _arrival_probability(self, channel: NDArray[np.int64]) -> Array:
         """Probability (sensors, N) that a packet arrives, given the state before."""
         sensor = np.arange(self.sensor_count)[:, None]
-        return 1.0 - (self.channel.transition @ self.channel.drop)[channel, sensor]
+        loss = namespace(channel).asarray(self.channel.transition @ self.channel.drop)
+        return 1.0 - loss[channel, sensor]
 
 
 def _diagonal(variance: Array) -> Array:
     """Covariances (n, n, N) of independent errors with variances (n, N)."""
-    size = len(variance)
-    result = np.zeros((size, *variance.shape))
-    for i in range(size):
-        result[i, i] = variance[i]
-    return result
+    return linalg.identity(len(variance)) * variance

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.fusion.rules import FusionRule
+from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.tobit.filters import (
     Expectation,
     KalmanFilter,
@@ -194,7 +195,9 @@ class FeedbackCentre(NodeCentre):
         """See :class:`Centre`; each node uses its planned outcome of a grant or of silence."""
         outcomes, root, share = _outcomes(prediction), prediction.root, self.feedback.share[:, None]
         grant = granted[:, None, None]
-        own = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
+        own = namespace(granted).where(
+            grant, outcomes.delivered_covariance, outcomes.silent_covariance
+        )
         local = self._shift(prediction, measurement, granted)
         fused = self.fusion.fuse(local, own / share[:, None], basis=root)
         return mean + linalg.matvec(root, fused.mean), linalg.congruence(root, fused.covariance)
@@ -218,7 +221,7 @@ class FeedbackCentre(NodeCentre):
         outcomes = _outcomes(prediction)
         innovation = measurement - prediction.expectation.value
         delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
-        local = np.where(granted[:, None], delivered, outcomes.silent_mean)
+        local = namespace(granted).where(granted[:, None], delivered, outcomes.silent_mean)
         return local / np.sqrt(self.feedback.share[:, None])
 
     def variances(
@@ -264,7 +267,7 @@ class FederatedCentre(NodeCentre):
         if weight is not None:
             # Both sides times √Z, so that weight 0 is no exception.
             scale = np.sqrt(weight / (1.0 + weight * sensors.variance[..., 0]))[..., None, None]
-            nothing = np.zeros_like(expectation.value)
+            nothing = 0.0 * expectation.value
             _, silent = joint_update(_stack(scale * observed), _stack(nothing))
             root = linalg.matmul(root, linalg.root(silent))
         return CentrePrediction(expectation, deviation, root)
@@ -278,14 +281,14 @@ class FederatedCentre(NodeCentre):
         granted: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
-        places = np.flatnonzero(granted.any(-1))
+        xp, places = namespace(granted), active_rows(granted)
         silent = covariance if self.filter.silence is None else linalg.gram(prediction.root)
         if not places.size:
             return mean, silent
         matrix, value = self._whitened(prediction, measurement, places)
-        matrix = np.where(granted[places, None, None], matrix, 0.0)
+        matrix = xp.where(granted[places, None, None], matrix, 0.0)
         mean, posterior = _shifted(mean, prediction, _stack(matrix), _stack(value))
-        return mean, np.where(granted.any(0), posterior, silent)
+        return mean, xp.where(granted.any(0), posterior, silent)
 
     def local_means(
         self,
@@ -302,7 +305,8 @@ class FederatedCentre(NodeCentre):
         total = linalg.matmul(cross, linalg.transpose(weighted))
         noise = sensors.variance * expectation.truncated_variance
         total = linalg.add_diagonal(total, self.feedback.share[:, None] * noise)
-        innovation = np.where(granted[:, None], measurement - expectation.value, 0.0)
+        innovation = measurement - expectation.value
+        innovation = namespace(innovation).where(granted[:, None], innovation, 0.0)
         shift = linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
         return mean + shift
 
@@ -330,7 +334,7 @@ class FederatedCentre(NodeCentre):
         if weight is not None:
             larger = 1.0 + weight[places, None] * noise
             noise, innovation = noise * larger, innovation * larger
-        scale = 1.0 / np.sqrt(noise)
+        scale = 1.0 / namespace(noise).sqrt(noise)
         matrix = linalg.matmul(sensors.measurement_matrix[places], prediction.root)
         scaled = scale * expectation.uncensored_probability[places]
         return scaled[..., None, :] * matrix, scale * innovation
@@ -352,7 +356,8 @@ class SequentialCentre(Centre):
         root = linalg.root(covariance)
         expectation = self.filter.expect(mean, root)
         floor = 1e-3 * self.sensors.variance
-        return CentrePrediction(expectation, np.sqrt(expectation.noise_variance + floor), root)
+        deviation = namespace(root).sqrt(expectation.noise_variance + floor)
+        return CentrePrediction(expectation, deviation, root)
 
     def update(
         self,
@@ -364,7 +369,8 @@ class SequentialCentre(Centre):
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
         mean, root = self.filter.update(mean, prediction.root, measurement, granted)
-        return mean, np.where(granted.any(0), linalg.gram(root), covariance)
+        fused = namespace(granted).where(granted.any(0), linalg.gram(root), covariance)
+        return mean, fused
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
@@ -378,7 +384,8 @@ class SequentialCentre(Centre):
 def _deviation(sensors: CensoredSensors, expectation: Expectation, spread: Array) -> Array:
     """Return the innovation's deviation from the variances ``spread`` of C x, all (l, m, N)."""
     q = expectation.uncensored_probability
-    return np.sqrt(q * q * spread + expectation.noise_variance + 1e-3 * sensors.variance)
+    variance = q * q * spread + expectation.noise_variance + 1e-3 * sensors.variance
+    return namespace(variance).sqrt(variance)
 
 
 def _stack(values: Array) -> Array:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import in_runs, namespace
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
 
@@ -107,18 +108,19 @@ def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tup
     identity = linalg.identity(size)
     posterior = identity - linalg.matmul(linalg.transpose(matrix), correction)
     posterior = linalg.symmetrise(posterior)
-    large = linalg.diagonal(spread) > _STARVED * noise
-    if large.any():
-        lanes = np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
-        gain = linalg.transpose(correction[..., lanes])
-        noise = np.broadcast_to(noise, matrix.shape[:-2] + matrix.shape[-1:])
-        parts = [identity - linalg.matmul(gain, matrix[..., lanes])]
-        parts.append(gain * np.sqrt(noise[..., lanes])[..., None, :, :])
-        if bias is not None:
-            parts.append(linalg.matvec(gain, bias[..., lanes])[..., None, :])
-        exact = linalg.gram(np.concatenate(parts, axis=-2))
-        ridge = size * _RIDGE * linalg.diagonal(exact)
-        posterior[..., lanes] = linalg.add_diagonal(exact, ridge)
+    xp, large = namespace(matrix, noise), linalg.diagonal(spread) > _STARVED * noise
+
+    def exact(correction: Array, matrix: Array, noise: Array, *bias: Array) -> tuple[Array]:
+        gain = linalg.transpose(correction)
+        parts = [identity - linalg.matmul(gain, matrix), gain * xp.sqrt(noise)[..., None, :, :]]
+        parts += [linalg.matvec(gain, part)[..., None, :] for part in bias]
+        form = linalg.gram(xp.concatenate(parts, axis=-2))
+        return (linalg.add_diagonal(form, size * _RIDGE * linalg.diagonal(form)),)
+
+    noise = xp.broadcast_to(noise, matrix.shape[:-2] + matrix.shape[-1:])
+    arguments = (correction, matrix, noise) if bias is None else (correction, matrix, noise, bias)
+    runs = large.reshape(-1, large.shape[-1]).any(0)
+    (posterior,) = in_runs(runs, exact, arguments, (posterior,))
     return correction, posterior
 
 
@@ -148,7 +150,7 @@ class Scalar(NamedTuple):
         It is G (I - w g gᵀ) with (1 - w gᵀ g)² = 1 - s gᵀ g/S, which loses no digits for any P.
         """
         left = share * self.noise + (1.0 - share) * self.variance
-        weight = share / (self.variance + np.sqrt(left * self.variance))
+        weight = share / (self.variance + namespace(left).sqrt(left * self.variance))
         return self.root - linalg.outer(self.cross * weight[..., None, :], self.projection)
 
 
@@ -163,26 +165,30 @@ def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
         value: B z + v (…, c, N), with v ~ N(0, I).
     """
     size = matrix.shape[-2]
-    both = np.concatenate([matrix, value[..., None, :]], axis=-2)
+    xp = namespace(matrix, value)
+    both = xp.concatenate([matrix, value[..., None, :]], axis=-2)
     if size < _LARGE:
         total = (matrix[..., :, None, :] * both[..., None, :, :]).sum(-4)
     else:
         total = linalg.matmul(linalg.transpose(matrix), both)
     covariance = linalg.inverse(linalg.identity(size) + total[..., :size, :])
     mean = linalg.matvec(covariance, total[..., size, :])
-    large = (matrix * matrix).sum(-2) > _STARVED
-    if large.any():
-        lanes = np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
-        root, shift = linalg.identity(size), np.zeros_like(mean[..., lanes])
-        for channel in range(matrix.shape[-3]):
-            row = matrix[..., channel, :, lanes]
-            row = np.moveaxis(row, 0, -1)
-            scalar = Scalar.from_row(root, row, np.ones(1))
-            residual = value[..., channel, lanes] - linalg.dot(row, shift)
-            shift = shift + scalar.cross * (residual / scalar.variance)[..., None, :]
-            root = scalar.posterior(1.0)
-        mean[..., lanes], covariance[..., lanes] = shift, linalg.gram(root)
-    return mean, covariance
+    large = ((matrix * matrix).sum(-2) > _STARVED).reshape(-1, matrix.shape[-1]).any(0)
+    results = in_runs(large, _sequential_update, (matrix, value), (mean, covariance))
+    return results[0], results[1]
+
+
+def _sequential_update(matrix: Array, value: Array) -> tuple[Array, Array]:
+    """Return the results of :func:`joint_update`, one channel after another."""
+    size = matrix.shape[-2]
+    root, shift = linalg.identity(size), namespace(matrix).zeros_like(matrix[..., 0, :, :])
+    for channel in range(matrix.shape[-3]):
+        row = matrix[..., channel, :, :]
+        scalar = Scalar.from_row(root, row, np.ones(1))
+        residual = value[..., channel, :] - linalg.dot(row, shift)
+        shift = shift + scalar.cross * (residual / scalar.variance)[..., None, :]
+        root = scalar.posterior(1.0)
+    return shift, linalg.gram(root)
 
 
 @dataclass(frozen=True)
@@ -220,13 +226,14 @@ class KalmanFilter:
     def expect(self, mean: Array) -> Expectation:
         """See :class:`NodeFilter`."""
         latent = linalg.matvec(self.sensors.measurement_matrix, mean)
-        ones = np.ones_like(latent)
+        xp = namespace(latent)
+        ones = xp.ones_like(latent)
         return Expectation(
             latent=latent,
             value=latent,
             noise_variance=self.sensors.variance * ones,
             uncensored_probability=ones,
-            hazard=np.zeros_like(latent),
+            hazard=xp.zeros_like(latent),
             truncated_variance=ones,
         )
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_limits
+from fusion_gym.namespace import namespace
 from fusion_gym.validation import ConfigurationError
 
 _RIDGE = 4e-15  # relative, for each state: twice what linalg.root takes for rounding
@@ -126,10 +127,11 @@ class CensoredSensors:
             noise = linalg.matvec(self.noise_correlation, noise)
         latent = linalg.matvec(self.measurement_matrix, state)
         latent += self.noise_deviation * noise.reshape(shape)
-        np.maximum(latent, true_limits(departure, self.threshold), out=latent)
+        xp = namespace(latent)
+        latent = xp.maximum(latent, true_limits(departure, self.threshold))
         if not self.two_sided:
             return latent
-        return np.minimum(latent, true_limits(departure, self.upper), out=latent)
+        return xp.minimum(latent, true_limits(departure, self.upper))
 
     @property
     def stacked_matrix(self) -> Array:
@@ -177,10 +179,10 @@ class CensoredSensors:
         result = linalg.add_diagonal(
             covariance, len(covariance) * _RIDGE * linalg.diagonal(covariance)
         )
-        limit = _LARGEST * self.resolution
-        if not result.max() > limit.min():
+        xp, limit = namespace(result), _LARGEST * self.resolution
+        if xp is np and not result.max() > limit.min():  # each scale is 1
             return result
-        scale = np.sqrt(limit / np.maximum(linalg.diagonal(result), limit))
+        scale = xp.sqrt(limit / xp.maximum(linalg.diagonal(result), limit))
         return result * linalg.outer(scale, scale)
 
     def censored(self, measurement: Array) -> NDArray[np.bool_]:

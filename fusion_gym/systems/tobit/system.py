@@ -25,6 +25,7 @@ from fusion_gym.core.system import (
     numbered,
     sensed,
 )
+from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 
@@ -252,8 +253,9 @@ class CensoredSystem(System[CensoredState]):
         """
         prior, prediction = (state.prior_mean, state.prior_covariance), sensed(state.prediction)
         mean, covariance = self.centre.update(*prior, prediction, state.measurement, granted)
-        held = np.where(granted[:, None], state.measurement, state.held)
-        age = np.where(granted, 0.0, state.age)
+        xp = namespace(granted)
+        held = xp.where(granted[:, None], state.measurement, state.held)
+        age = xp.where(granted, 0.0, state.age)
         return replace(state, held=held, age=age, mean=mean, covariance=covariance)
 
     def single_deliveries(self, state: CensoredState) -> tuple[Array, Array]:
@@ -288,7 +290,9 @@ class CensoredSystem(System[CensoredState]):
 
     def _log_variance(self, state: CensoredState) -> Array:
         variances = (linalg.diagonal(state.prior_covariance), self.reference[:, None])
-        now, usual = (np.log(np.maximum(values, _TINY)) for values in variances)
+        now, usual = (
+            namespace(values).log(namespace(values).maximum(values, _TINY)) for values in variances
+        )
         return now - usual
 
     def visible(self, state: CensoredState) -> CensoredState:

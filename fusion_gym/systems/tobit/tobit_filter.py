@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.tobit.filters import Expectation, KalmanFilter, Scalar
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
@@ -34,7 +35,7 @@ def censored_moments(sensors: CensoredSensors, latent: Array, deviation: Array) 
         return _two_sided_moments(sensors, latent, deviation)
     moments = gaussian.tobit_moments((sensors.threshold - latent) / deviation)
     q = moments.uncensored_probability
-    excess = np.where(sensors.uncensored, 0.0, moments.excess)
+    excess = namespace(q).where(sensors.uncensored, 0.0, moments.excess)
     variance = q * moments.truncated_variance + q * (1.0 - q) * excess * excess
     value = q * (latent + deviation * moments.hazard) + (1.0 - q) * sensors.finite_threshold
     return Expectation(
@@ -58,10 +59,10 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
     high = (sensors.upper - latent) / deviation
     moments = gaussian.interval_moments(low, high)
     below, above = gaussian.upper_tail(-low), gaussian.upper_tail(high)
-    inside = moments.probability
+    xp, inside = namespace(latent), moments.probability
     centre = latent + deviation * moments.mean
-    to_low = np.where(np.isinf(sensors.threshold), 0.0, centre - sensors.finite_threshold)
-    to_high = np.where(np.isinf(sensors.upper), 0.0, sensors.finite_upper - centre)
+    to_low = xp.where(np.isinf(sensors.threshold), 0.0, centre - sensors.finite_threshold)
+    to_high = xp.where(np.isinf(sensors.upper), 0.0, sensors.finite_upper - centre)
     between = (
         below * inside * to_low**2
         + inside * above * to_high**2
@@ -73,7 +74,7 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
         noise_variance=inside * deviation**2 * moments.variance + between,
         uncensored_probability=inside,
         hazard=moments.mean,
-        truncated_variance=np.clip(moments.variance, 1e-12, 1.0),
+        truncated_variance=xp.clip(moments.variance, 1e-12, 1.0),
     )
 
 
@@ -158,14 +159,15 @@ class AssumedDensityFilter:
         """Return the moments of the measurements (sensors, m, N) under the prior N(mean, G Gᵀ)."""
         matrix = self.sensors.measurement_matrix
         latent = linalg.matvec(matrix, mean)
-        spread = np.square(linalg.matmul(matrix, root)).sum(-2) + self.sensors.variance
-        return censored_moments(self.sensors, latent, np.sqrt(spread))
+        xp = namespace(mean)
+        spread = xp.square(linalg.matmul(matrix, root)).sum(-2) + self.sensors.variance
+        return censored_moments(self.sensors, latent, xp.sqrt(spread))
 
     def update(
         self, mean: Array, root: Array, measurement: Array, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
         """Return mean (n, N) and root (n, n, N) after the granted (sensors, N) measurements."""
-        for sensor in np.flatnonzero(granted.any(-1)).tolist():
+        for sensor in active_rows(granted).tolist():
             for component in range(self.sensors.size):
                 value, taken = measurement[sensor, component], granted[sensor]
                 mean, root = self._take(mean, root, sensor, component, value, taken)
@@ -178,16 +180,16 @@ class AssumedDensityFilter:
         explains; it is exact for sensors of one component.
         """
         matrix, noise = self.sensors.measurement_matrix, self.sensors.variance
-        latent = linalg.matvec(matrix, mean)
+        xp, latent = namespace(mean, root), linalg.matvec(matrix, mean)
         root = root[None]
         for component in range(self.sensors.size):
             row = matrix[:, component]
             scalar = Scalar.from_row(root, row, noise[:, component])
-            share, deviation = np.ones_like(scalar.variance), np.sqrt(scalar.variance)
+            share, deviation = xp.ones_like(scalar.variance), xp.sqrt(scalar.variance)
             for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
                 limit = threshold[:, component]
                 distance = sign * (latent[:, component] - limit) / deviation
-                distance = np.where(np.isfinite(limit), distance, _FAR)
+                distance = xp.where(np.isfinite(limit), distance, _FAR)
                 share -= gaussian.upper_tail(distance) * gaussian.truncated_variance(distance)
             root = scalar.posterior(share)
         return linalg.gram(root)
@@ -203,19 +205,20 @@ class AssumedDensityFilter:
     ) -> tuple[Array, Array]:
         row = self.sensors.measurement_matrix[sensor, component]
         scalar = Scalar.from_row(root, row, self.sensors.variance[sensor, component])
-        latent, deviation = linalg.dot(row, mean), np.sqrt(scalar.variance)
+        xp = namespace(mean, root)
+        latent, deviation = linalg.dot(row, mean), xp.sqrt(scalar.variance)
         step = (value - latent) / scalar.variance
-        loss = np.ones_like(step)
+        loss = xp.ones_like(step)
         for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
             limit = threshold[sensor, component]
             if not np.isfinite(limit).all():
                 continue
             censored = value <= limit if sign > 0 else value >= limit
             distance = sign * (latent - limit) / deviation
-            step = np.where(censored, -sign * gaussian.hazard(distance) / deviation, step)
-            loss = np.where(censored, _loss(distance), loss)
-        step = np.where(granted, step, 0.0)
-        loss = np.where(granted, loss, 0.0)
+            step = xp.where(censored, -sign * gaussian.hazard(distance) / deviation, step)
+            loss = xp.where(censored, _loss(distance), loss)
+        step = xp.where(granted, step, 0.0)
+        loss = xp.where(granted, loss, 0.0)
         return mean + scalar.cross * step, scalar.posterior(loss)
 
 

@@ -1,0 +1,195 @@
+"""One source for NumPy and JAX: the namespace of an array, and updates that both allow.
+
+A function begins with ``xp = namespace(a)`` and calls ``xp.where`` and the like. NumPy's arrays are
+updated in place, JAX's are replaced, so callers continue with the returned array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+_FAULTY = (26.0, 28.0)  # jax.scipy.special.erfcx returns 0 in a part of this interval
+
+
+def namespace(*arrays: Any) -> Any:
+    """Return ``jax.numpy`` if one of the arrays is JAX's, and otherwise ``numpy``."""
+    for array in arrays:
+        if type(array) is not np.ndarray:
+            find = getattr(array, "__array_namespace__", None)
+            if find is not None and (xp := find()) is not np:
+                return xp
+    return np
+
+
+def as_array(value: Any) -> Any:
+    """Return a JAX array as it is, and any other value as a NumPy array of float64."""
+    return np.asarray(value, dtype=np.float64) if namespace(value) is np else value
+
+
+def set_at(array: Any, index: tuple[Any, ...], value: Any) -> Any:
+    """Return ``array`` with ``array[index] = value``.
+
+    Under JAX padding replaces a scatter, which XLA cannot fuse.
+
+    Args:
+        array: The array; NumPy's is changed in place.
+        index: Whole numbers and slices with step 1, one for each of the last axes.
+        value: Broadcasts to ``array[index]``.
+    """
+    if isinstance(array, np.ndarray):
+        array[(..., *index)] = value
+        return array
+    xp, lead = namespace(array), array.ndim - len(index)
+    sizes = array.shape[lead:]
+    spans = [
+        part.indices(size)[:2] if isinstance(part, slice) else (part % size, part % size + 1)
+        for part, size in zip(index, sizes, strict=True)
+    ]
+    mask = np.zeros(sizes, dtype=np.bool_)
+    mask[tuple(slice(*span) for span in spans)] = True
+    value = xp.broadcast_to(value, array[(..., *index)].shape)
+    for axis, part in enumerate(index):
+        if not isinstance(part, slice):
+            value = xp.expand_dims(value, lead + axis)
+    pads = [(0, 0)] * lead + [(a, size - b) for (a, b), size in zip(spans, sizes, strict=True)]
+    return xp.where(mask, xp.pad(value, pads), array)
+
+
+def update_at(function: np.ufunc, array: Any, index: tuple[Any, ...], value: Any) -> Any:
+    """Return ``array`` with ``array[index] = function(array[index], value)``.
+
+    Args:
+        function: A function of two arguments such as ``numpy.add``.
+        array: The array; NumPy's is changed in place.
+        index: As in :func:`set_at`.
+        value: Broadcasts to ``array[index]``.
+    """
+    part = array[(..., *index)]
+    if isinstance(array, np.ndarray):
+        function(part, value, out=part)
+        return array
+    return set_at(array, index, getattr(namespace(array), function.__name__)(part, value))
+
+
+def in_lanes(
+    mask: Any,
+    function: Callable[..., Sequence[Any]],
+    arguments: Sequence[Any],
+    results: Sequence[Any],
+    default: Sequence[float],
+) -> Sequence[Any]:
+    """Return ``results`` with ``function(*arguments)`` where ``mask`` holds.
+
+    NumPy evaluates the function on these elements only, JAX on all if the mask holds anywhere.
+
+    Args:
+        mask: Bool, of the shape of the arguments and results.
+        function: Element by element on one-dimensional arguments.
+        arguments: Arrays.
+        results: Arrays; NumPy's are changed in place.
+        default: Arguments of the other elements under JAX, at which the function is finite.
+    """
+    xp = namespace(mask, *arguments)
+    if xp is np:
+        if mask.any():
+            values = function(*(argument[mask] for argument in arguments))
+            for result, value in zip(results, values, strict=True):
+                result[mask] = value
+        return results
+    from jax import lax
+
+    def every(values: Sequence[Any]) -> tuple[Any, ...]:
+        pairs = zip(arguments, default, strict=True)
+        inputs = [xp.where(mask, argument, number).ravel() for argument, number in pairs]
+        new = (value.reshape(mask.shape) for value in function(*inputs))
+        return tuple(xp.where(mask, a, b) for a, b in zip(new, values, strict=True))
+
+    return lax.cond(mask.any(), every, tuple, tuple(results))
+
+
+def in_runs(
+    mask: Any,
+    function: Callable[..., Sequence[Any]],
+    arguments: Sequence[Any],
+    results: Sequence[Any],
+) -> Sequence[Any]:
+    """Return ``results`` with ``function(*arguments)`` in the runs of ``mask`` (N,).
+
+    NumPy evaluates the function on these runs only, JAX on all if the mask holds anywhere.
+
+    Args:
+        mask: (N,) bool.
+        function: Run by run on arrays (…, N).
+        arguments: Arrays (…, N).
+        results: Arrays (…, N); NumPy's are changed in place.
+    """
+    xp = namespace(mask, *arguments)
+    if xp is np:
+        runs = np.flatnonzero(mask)
+        if runs.size:
+            values = function(*(argument[..., runs] for argument in arguments))
+            for result, value in zip(results, values, strict=True):
+                result[..., runs] = value
+        return results
+    from jax import lax
+
+    def every(values: Sequence[Any]) -> tuple[Any, ...]:
+        pairs = zip(function(*arguments), values, strict=True)
+        return tuple(xp.where(mask, new, old) for new, old in pairs)
+
+    return lax.cond(mask.any(), every, tuple, tuple(results))
+
+
+def active_rows(mask: Any) -> NDArray[np.int64]:
+    """Return the rows of ``mask`` (rows, N) that hold anywhere; under JAX all rows."""
+    return np.flatnonzero(mask.any(-1)) if namespace(mask) is np else np.arange(len(mask))
+
+
+def permute(values: Any, place: Any) -> Any:
+    """Return (rows, N) with entry i of each run at row ``place[i]``, a permutation (rows, N)."""
+    xp = namespace(values, place)
+    if xp is not np:
+        return xp.take_along_axis(values, xp.argsort(place, axis=0), axis=0)
+    result = np.empty(values.shape, values.dtype)
+    result.reshape(-1)[place * values.shape[1] + np.arange(values.shape[1])] = values
+    return result
+
+
+def gather(values: Any, place: Any) -> Any:
+    """Return the entries (rows, N) of ``values`` at the rows ``place`` (rows, N) of each run."""
+    xp = namespace(values, place)
+    if xp is not np:
+        return xp.take_along_axis(values, place, axis=0)
+    return values.take(place * values.shape[1] + np.arange(values.shape[1]))
+
+
+def ndtr(z: Any) -> Any:
+    """Return the standard normal distribution function."""
+    return _special(z).ndtr(z)
+
+
+def erfcx(x: Any) -> Any:
+    """Return the scaled complementary error function exp(x²) erfc(x)."""
+    result = _special(x).erfcx(x)
+    xp = namespace(x)
+    if xp is np:
+        return result
+    far = xp.where((x > _FAULTY[0]) & (x < _FAULTY[1]), x, _FAULTY[1])
+    small, series = 0.5 / far**2, 1.0
+    for k in (9.0, 7.0, 5.0, 3.0, 1.0):
+        series = 1.0 - k * small * series
+    series = series / (far * np.sqrt(np.pi))
+    return xp.where((x > _FAULTY[0]) & (x < _FAULTY[1]), series, result)
+
+
+def _special(array: Any) -> Any:
+    if namespace(array) is np:
+        return scipy.special
+    import jax.scipy.special
+
+    return jax.scipy.special

@@ -1,0 +1,94 @@
+"""One source on NumPy and JAX: equal results, and no code that JAX cannot trace."""
+
+import ast
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from fusion_gym import gaussian, linalg, namespace
+
+jax.config.update("jax_enable_x64", True)
+PACKAGE = Path(namespace.__file__).parent
+# Modules whose functions take JAX's arrays.
+MODULES = ("linalg", "gaussian")
+RUNS = 5
+
+
+def definite(size: int) -> Any:
+    """Positive definite matrices, and in the last run an indefinite one."""
+    root = np.random.default_rng(size).normal(size=(2, RUNS, size, size))
+    matrix = root @ root.swapaxes(-1, -2) + 0.1 * np.eye(size)
+    matrix[:, -1] *= -1.0
+    return np.moveaxis(matrix, 1, -1)
+
+
+def singular(size: int) -> Any:
+    root = np.random.default_rng(size).normal(size=(RUNS, size, max(size - 1, 1)))
+    return np.moveaxis(root @ root.swapaxes(-1, -2), 0, -1)
+
+
+def vectors(size: int) -> Any:
+    return np.random.default_rng(1).normal(size=(2, size, RUNS))
+
+
+ENDS = np.concatenate([np.linspace(-40.0, 80.0, 241), [6.9, 7.0, 7.1, 37.0, 37.6, 38.0]])
+LOW, WIDTH = (x.ravel() for x in np.meshgrid(np.linspace(-50.0, 50.0, 31), [0.01, 1.0, 2.9, 9.0]))
+CASES: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+    "tobit_moments": (gaussian.tobit_moments, (ENDS,)),
+    "interval_moments": (gaussian.interval_moments, (LOW, LOW + WIDTH)),
+    "density": (gaussian.density, (ENDS,)),
+    "upper_tail": (gaussian.upper_tail, (ENDS,)),
+    "erfcx": (namespace.erfcx, (ENDS[ENDS > -30.0],)),
+}
+for n in (1, 2, 4):
+    matrix, vector = definite(n), vectors(n)
+    for function in (linalg.cholesky, linalg.inverse, linalg.symmetrise, linalg.trace, linalg.gram):
+        CASES[f"{function.__name__}-{n}"] = function, (matrix,)
+    CASES[f"root-{n}"] = linalg.root, (singular(n),)
+    for function in (linalg.matvec, linalg.solve_vector, linalg.add_diagonal):
+        CASES[f"{function.__name__}-{n}"] = function, (matrix, vector)
+    for function in (linalg.solve, linalg.whiten, linalg.congruence, linalg.matmul):
+        CASES[f"{function.__name__}-{n}"] = function, (matrix, definite(n)[..., ::-1, :])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_jax_equals_numpy(name: str) -> None:
+    function, arguments = CASES[name]
+    before = [argument.copy() for argument in arguments]
+    with np.errstate(all="ignore"):
+        expected, result = function(*arguments), jax.jit(function)(*arguments)
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(result), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-11, atol=1e-13)
+    for argument, copy in zip(arguments, before, strict=True):
+        np.testing.assert_array_equal(argument, copy)  # arguments are not updated in place
+
+
+@pytest.mark.parametrize(
+    "index", [(1,), (slice(None), -1), (slice(1, 3), 0), (slice(2), slice(1, None))]
+)
+def test_updates_equal_assignment(index: tuple[Any, ...]) -> None:
+    array = np.random.default_rng(0).normal(size=(2, 4, 3))[..., : len(index) * 3]
+    array = array if len(index) == 2 else array[..., 0]
+    expected = array.copy()
+    expected[(..., *index)] = 7.0
+    other = array.copy()
+    other[(..., *index)] += 2.0
+    for start in (array.copy, lambda: jax.numpy.asarray(array)):
+        np.testing.assert_array_equal(namespace.set_at(start(), index, 7.0), expected)
+        np.testing.assert_array_equal(namespace.update_at(np.add, start(), index, 2.0), other)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_functions_can_be_traced(module: str) -> None:
+    """Index writes stand only in functions of LAPACK's stacks, which JAX never calls."""
+    tree = ast.parse((PACKAGE / f"{module}.py").read_text())
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    for function in (node for node in functions if not node.name.endswith("_of_stack")):
+        for node in ast.walk(function):
+            targets = node.targets if isinstance(node, ast.Assign) else []
+            targets = [node.target] if isinstance(node, ast.AugAssign) else targets
+            assert not [t for t in targets if isinstance(t, ast.Subscript)], function.name
