@@ -69,7 +69,7 @@ def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
     """Return ``a + diag(d)`` of ``(..., n, n, N)`` and d broadcastable to ``(..., n, N)``."""
     result = a.copy()
     for k in range(a.shape[-2]):
-        result = update_at(np.add, result, (k, k, _ALL), d[..., k, :])
+        result = update_at(np.add, result, (..., k, k, _ALL), d[..., k, :])
     return result
 
 
@@ -191,7 +191,7 @@ def gram(f: FloatArray) -> FloatArray:
 
 def _inverse_root(x: FloatArray) -> FloatArray:
     """Return ``1 / sqrt(x)`` for positive x and NaN for zero, negative or infinite x."""
-    root: FloatArray = namespace(x).sqrt(x)
+    root: FloatArray = x**0.5
     root /= x
     return root
 
@@ -238,19 +238,19 @@ def _eliminate(work: FloatArray, right: Any) -> tuple[FloatArray, Any, FloatArra
     size = work.shape[-2]
     for k in range(size):
         inverse_pivot, below = _inverse_root(work[..., k, k, :]), slice(k + 1, None)
-        work = set_at(work, (k, k, _ALL), inverse_pivot)
+        work = set_at(work, (..., k, k, _ALL), inverse_pivot)
         if right is not None:
             scale = inverse_pivot[..., None, :]
-            right = update_at(np.multiply, right, (k, _ALL, _ALL), scale)
+            right = update_at(np.multiply, right, (..., k, _ALL, _ALL), scale)
         if k + 1 == size:
             break
-        work = update_at(np.multiply, work, (below, k, _ALL), inverse_pivot[..., None, :])
+        work = update_at(np.multiply, work, (..., below, k, _ALL), inverse_pivot[..., None, :])
         column = work[..., k + 1 :, k, :]
         square = column[..., :, None, :] * column[..., None, :, :]
-        work = update_at(np.subtract, work, (below, below, _ALL), square)
+        work = update_at(np.subtract, work, (..., below, below, _ALL), square)
         if right is not None:
             product = column[..., :, None, :] * right[..., k : k + 1, :, :]
-            right = update_at(np.subtract, right, (below, _ALL, _ALL), product)
+            right = update_at(np.subtract, right, (..., below, _ALL, _ALL), product)
     return work, right, inverse_pivot
 
 
@@ -272,9 +272,9 @@ def cholesky(a: FloatArray) -> FloatArray:
     for i in range(work.shape[-2]):
         left = work[..., i, :i, :] / scale[..., i : i + 1, :] + poison[..., None, :]
         pivot = 1.0 / (work[..., i, i, :] * scale[..., i, :]) + poison
-        factor = set_at(factor, (i, slice(i + 1, None), _ALL), poison[..., None, :])
-        factor = set_at(factor, (i, slice(i), _ALL), left)
-        factor = set_at(factor, (i, i, _ALL), pivot)
+        factor = set_at(factor, (..., i, slice(i + 1, None), _ALL), poison[..., None, :])
+        factor = set_at(factor, (..., i, slice(i), _ALL), left)
+        factor = set_at(factor, (..., i, i, _ALL), pivot)
     return factor
 
 
@@ -306,12 +306,12 @@ def root(a: FloatArray) -> FloatArray:
         correlation = xp.minimum(xp.maximum(correlation, -1.0), 1.0)
         left = (1.0 - correlation) * (1.0 + correlation)
         left = xp.where(left <= size * _ROUNDING, 0.0, left)
-        result = set_at(result, (0, 0, _ALL), scale[..., 0, :])
-        result = set_at(result, (1, 0, _ALL), scale[..., 1, :] * correlation)
-        return set_at(result, (1, 1, _ALL), scale[..., 1, :] * xp.sqrt(left))
+        result = set_at(result, (..., 0, 0, _ALL), scale[..., 0, :])
+        result = set_at(result, (..., 1, 0, _ALL), scale[..., 1, :] * correlation)
+        return set_at(result, (..., 1, 1, _ALL), scale[..., 1, :] * xp.sqrt(left))
     rest = unit[..., :, None, :] * a * unit[..., None, :, :]
     for k in range(size):  # exact, so that rounding does not decide the first pivot
-        rest = set_at(rest, (k, k, _ALL), xp.where(scale[..., k, :] == 0.0, 0.0, 1.0))
+        rest = set_at(rest, (..., k, k, _ALL), xp.where(scale[..., k, :] == 0.0, 0.0, 1.0))
     if size >= _LARGE and xp is np:
         return scale[..., :, None, :] * _by_lane(_root_of_stack, rest)
     for k in range(size):
@@ -320,7 +320,7 @@ def root(a: FloatArray) -> FloatArray:
         pivot = xp.take_along_axis(left, first, -2)
         column = xp.take_along_axis(rest, first[..., None, :, :], -3)[..., 0, :, :]
         column = xp.where(pivot <= size * _ROUNDING, 0.0, column / xp.sqrt(pivot))
-        result = set_at(result, (_ALL, k, _ALL), scale * column)
+        result = set_at(result, (..., _ALL, k, _ALL), scale * column)
         rest -= outer(column, column)
     return result
 
@@ -372,10 +372,10 @@ def solve(a: FloatArray, b: FloatArray) -> FloatArray:
     work, scale = _equilibrate(a)
     work, x, _ = _eliminate(work, b * scale[..., :, None, :])
     for k in range(size - 1, -1, -1):
-        x = update_at(np.multiply, x, (k, _ALL, _ALL), work[..., k, k, None, :])
+        x = update_at(np.multiply, x, (..., k, _ALL, _ALL), work[..., k, k, None, :])
         if k:
             product = work[..., k, :k, None, :] * x[..., k : k + 1, :, :]
-            x = update_at(np.subtract, x, (slice(k), _ALL, _ALL), product)
+            x = update_at(np.subtract, x, (..., slice(k), _ALL, _ALL), product)
     x *= scale[..., :, None, :]
     return x
 
@@ -430,25 +430,25 @@ def inverse(a: FloatArray) -> FloatArray:
     if size == 2:
         correlation, weight = _pair_scales(a)
         result = outer(weight, weight)
-        result = update_at(np.multiply, result, (0, 1, _ALL), -correlation)
-        return set_at(result, (1, 0, _ALL), result[..., 0, 1, :])
+        result = update_at(np.multiply, result, (..., 0, 1, _ALL), -correlation)
+        return set_at(result, (..., 1, 0, _ALL), result[..., 0, 1, :])
     work, scale = _equilibrate(a)
     if size >= _LARGE and xp is np:
         return _by_lane(_inverse_of_stack, work) * outer(scale, scale)
     # Rows from n on become the upper triangular diag(scale) L^-T.
     stack = xp.zeros((*a.shape[:-3], 2 * size, size, a.shape[-1]))
-    stack = set_at(stack, (slice(size), _ALL, _ALL), work)
+    stack = set_at(stack, (..., slice(size), _ALL, _ALL), work)
     for k in range(size):
         rows, pivot = slice(k + 1, size + k + 1), _inverse_root(stack[..., k, k, :])
-        stack = set_at(stack, (size + k, k, _ALL), scale[..., k, :])
-        stack = update_at(np.multiply, stack, (rows, k, _ALL), pivot[..., None, :])
+        stack = set_at(stack, (..., size + k, k, _ALL), scale[..., k, :])
+        stack = update_at(np.multiply, stack, (..., rows, k, _ALL), pivot[..., None, :])
         if k + 1 < size:
             column = stack[..., rows, k, :]
             product = column[..., :, None, :] * column[..., None, : size - k - 1, :]
-            stack = update_at(np.subtract, stack, (rows, slice(k + 1, None), _ALL), product)
+            stack = update_at(np.subtract, stack, (..., rows, slice(k + 1, None), _ALL), product)
     column = stack[..., size:, size - 1, :]
     result = outer(column, column)
     for k in range(size - 1):
         column, corner = stack[..., size : size + k + 1, k, :], slice(k + 1)
-        result = update_at(np.add, result, (corner, corner, _ALL), outer(column, column))
+        result = update_at(np.add, result, (..., corner, corner, _ALL), outer(column, column))
     return result

@@ -13,16 +13,18 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
+_NDARRAY = np.ndarray
 _FAULTY = (26.0, 28.0)  # jax.scipy.special.erfcx returns 0 in a part of this interval
 
 
-def namespace(*arrays: Any) -> Any:
+def namespace(array: Any, other: Any = None) -> Any:
     """Return ``jax.numpy`` if one of the arrays is JAX's, and otherwise ``numpy``."""
-    for array in arrays:
-        if type(array) is not np.ndarray:
-            find = getattr(array, "__array_namespace__", None)
-            if find is not None and (xp := find()) is not np:
-                return xp
+    if type(array) is _NDARRAY and (other is None or type(other) is _NDARRAY):
+        return np
+    for item in (array, other):
+        find = getattr(item, "__array_namespace__", None)
+        if find is not None and (xp := find()) is not np:
+            return xp
     return np
 
 
@@ -38,13 +40,14 @@ def set_at(array: Any, index: tuple[Any, ...], value: Any) -> Any:
 
     Args:
         array: The array; NumPy's is changed in place.
-        index: Whole numbers and slices with step 1, one for each of the last axes.
+        index: An ellipsis, then whole numbers and slices with step 1 for the last axes.
         value: Broadcasts to ``array[index]``.
     """
-    if isinstance(array, np.ndarray):
-        array[(..., *index)] = value
+    if type(array) is _NDARRAY:
+        array[index] = value
         return array
-    xp, lead = namespace(array), array.ndim - len(index)
+    xp, value = namespace(array), namespace(array).broadcast_to(value, array[index].shape)
+    index, lead = index[1:], array.ndim - len(index) + 1
     sizes = array.shape[lead:]
     spans = [
         part.indices(size)[:2] if isinstance(part, slice) else (part % size, part % size + 1)
@@ -52,7 +55,6 @@ def set_at(array: Any, index: tuple[Any, ...], value: Any) -> Any:
     ]
     mask = np.zeros(sizes, dtype=np.bool_)
     mask[tuple(slice(*span) for span in spans)] = True
-    value = xp.broadcast_to(value, array[(..., *index)].shape)
     for axis, part in enumerate(index):
         if not isinstance(part, slice):
             value = xp.expand_dims(value, lead + axis)
@@ -69,8 +71,8 @@ def update_at(function: np.ufunc, array: Any, index: tuple[Any, ...], value: Any
         index: As in :func:`set_at`.
         value: Broadcasts to ``array[index]``.
     """
-    part = array[(..., *index)]
-    if isinstance(array, np.ndarray):
+    part = array[index]
+    if type(array) is _NDARRAY:
         function(part, value, out=part)
         return array
     return set_at(array, index, getattr(namespace(array), function.__name__)(part, value))
@@ -94,7 +96,7 @@ def in_lanes(
         results: Arrays; NumPy's are changed in place.
         default: Arguments of the other elements under JAX, at which the function is finite.
     """
-    xp = namespace(mask, *arguments)
+    xp = namespace(mask)
     if xp is np:
         if mask.any():
             values = function(*(argument[mask] for argument in arguments))
@@ -118,36 +120,47 @@ def in_runs(
     arguments: Sequence[Any],
     results: Sequence[Any],
 ) -> Sequence[Any]:
-    """Return ``results`` with ``function(*arguments)`` in the runs of ``mask`` (N,).
+    """Return ``results`` with ``function(*arguments)`` in the runs of ``mask``.
 
     NumPy evaluates the function on these runs only, JAX on all if the mask holds anywhere.
 
     Args:
-        mask: (N,) bool.
+        mask: (…, N) bool; a run is selected if any of its entries holds.
         function: Run by run on arrays (…, N).
-        arguments: Arrays (…, N).
+        arguments: Arrays (…, N) or (…, 1).
         results: Arrays (…, N); NumPy's are changed in place.
     """
-    xp = namespace(mask, *arguments)
+    xp = namespace(mask)
     if xp is np:
-        runs = np.flatnonzero(mask)
-        if runs.size:
-            values = function(*(argument[..., runs] for argument in arguments))
-            for result, value in zip(results, values, strict=True):
+        if mask.any():
+            runs = np.flatnonzero(mask.reshape(-1, mask.shape[-1]).any(0))
+            parts = (part if part.shape[-1] == 1 else part[..., runs] for part in arguments)
+            for result, value in zip(results, function(*parts), strict=True):
                 result[..., runs] = value
         return results
     from jax import lax
 
     def every(values: Sequence[Any]) -> tuple[Any, ...]:
         pairs = zip(function(*arguments), values, strict=True)
-        return tuple(xp.where(mask, new, old) for new, old in pairs)
+        return tuple(xp.where(selected, new, old) for new, old in pairs)
 
-    return lax.cond(mask.any(), every, tuple, tuple(results))
+    selected = mask.reshape(-1, mask.shape[-1]).any(0)
+    return lax.cond(selected.any(), every, tuple, tuple(results))
 
 
 def active_rows(mask: Any) -> NDArray[np.int64]:
     """Return the rows of ``mask`` (rows, N) that hold anywhere; under JAX all rows."""
     return np.flatnonzero(mask.any(-1)) if namespace(mask) is np else np.arange(len(mask))
+
+
+def ranked_sum(values: Any, place: Any) -> Any:
+    """Return for each entry (rows, N) the sum of a run's entries up to its place, a permutation."""
+    xp = namespace(values, place)
+    if xp is not np:
+        return gather(xp.cumsum(permute(values, place), axis=0), place)
+    total, place = np.empty(values.shape), place * values.shape[1] + np.arange(values.shape[1])
+    total.reshape(-1)[place] = values
+    return np.cumsum(total, axis=0).take(place)
 
 
 def permute(values: Any, place: Any) -> Any:

@@ -217,11 +217,14 @@ class ObservationLayout:
         filled = [block.fill(state) for block in self._own]
         filled += [block.fill(beliefs()) for block in self._memory]
         filled += [block.fill(network) for block in self._network]
-        xp = namespace(*filled)
-        rows = xp.concatenate([xp.asarray(part, dtype=np.float64) for part in filled])
+        xp = namespace(network.tokens)
+        rows = xp.concatenate(filled, dtype=np.float64)
+        if xp is not np:
+            return xp.clip(rows.T.astype(np.float32), self.low, self.high)
         with np.errstate(over="ignore"):  # an overflow exceeds every bound
-            result = xp.asarray(rows.T, dtype=np.float32, **({"order": "C"} if xp is np else {}))
-        return xp.minimum(xp.maximum(result, self.low), self.high)
+            result = np.ascontiguousarray(rows.T, dtype=np.float32)
+        np.maximum(result, self.low, out=result)
+        return np.minimum(result, self.high, out=result)
 
     def replace_beliefs(
         self, observation: NDArray[np.float32], beliefs: Beliefs

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import SharingRule
-from fusion_gym.namespace import gather, namespace, permute
+from fusion_gym.namespace import gather, namespace, permute, ranked_sum
 from fusion_gym.validation import ConfigurationError
 
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
@@ -178,9 +178,7 @@ class TokenBucket:
         self, tokens: Array, requests: NDArray[np.bool_], queue: Queue
     ) -> NDArray[np.bool_]:
         """Grant each request if the tokens pay for it and all requests ahead in the queue."""
-        xp = namespace(tokens, requests, queue)
-        total = xp.cumsum(permute(requests * self.cost, queue), axis=0)
-        return requests & gather(total <= tokens + _ROUNDING, queue)
+        return requests & (ranked_sum(requests * self.cost, queue) <= tokens + _ROUNDING)
 
     def _grant_in_order(
         self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]

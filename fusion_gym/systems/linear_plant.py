@@ -135,8 +135,7 @@ class LinearPlant(Plant):
             return linalg.matvec(self.transition, mean), prior
         most = (self._cancelling * linalg.diagonal(covariance)[..., None, :, :]).sum(-2)
         cancelled = linalg.diagonal(prior) < most
-        runs = cancelled.reshape(-1, cancelled.shape[-1]).any(0)
-        (prior,) = in_runs(runs, self._predict_root, (covariance,), (prior,))
+        (prior,) = in_runs(cancelled, self._predict_root, (covariance,), (prior,))
         return linalg.matvec(self.transition, mean), prior
 
     def _predict_root(self, covariance: Array) -> tuple[Array]:

@@ -298,4 +298,4 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
 
 def _diagonal(variance: Array) -> Array:
     """Covariances (n, n, N) of independent errors with variances (n, N)."""
-    return linalg.identity(len(variance)) * variance
+    return variance[None] if len(variance) == 1 else linalg.identity(len(variance)) * variance

@@ -8,7 +8,6 @@ C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter updates with t
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace
 from fusion_gym.systems.tobit.filters import Expectation, Outcomes, linear_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
@@ -73,6 +73,8 @@ class EventError:
     Ξ(G) = ``growth`` G + ``offset``, G' = Ξ(G), G₀ = ``initial``; each of shape (sensors, 1), in
     squared units of the measurement. It belongs to the dynamic event trigger: a delivered
     measurement is the current one and has no event error, under any policy.
+
+    Source: tobit_token_bucket, equations (33), (34) and below (30).
     """
 
     growth: Array
@@ -81,9 +83,10 @@ class EventError:
 
     def at(self, time: Array) -> Array:
         """Return Ξ(G_{t-1}) (sensors, N) at the steps t = ``time`` (N,), counted from 1."""
-        rate, logarithm = self._growth_rate
-        ramp = np.where(rate == 0.0, time, np.expm1(logarithm * time) / np.where(rate, rate, 1.0))
-        return self.initial * np.exp(logarithm * time) + self.offset * ramp
+        xp, (rate, logarithm) = namespace(time), self._growth_rate
+        ramp = xp.expm1(logarithm * time) / np.where(rate, rate, 1.0)
+        ramp = xp.where(rate == 0.0, time, ramp)
+        return self.initial * xp.exp(logarithm * time) + self.offset * ramp
 
     @functools.cached_property
     def _growth_rate(self) -> tuple[Array, Array]:
@@ -202,7 +205,7 @@ class BoundTobitFilter:
             silent = self._held(matrix, spread, moment, expectation, held)
         else:
             prior = np.broadcast_to(linalg.identity(matrix.shape[2]), delivered.shape)
-            silent = np.zeros_like(delivered[:, 0]), prior
+            silent = np.zeros(delivered[:, 0].shape), prior
         return Outcomes(correction, delivered, *silent)
 
     def _delivered(
@@ -211,7 +214,8 @@ class BoundTobitFilter:
         """Return correction and bound after a delivery, θ = 0."""
         k1, k2, k3, _, _, k6, _, k8 = self.constants.kappa
         variance, threshold = self.sensors.variance, self.sensors.finite_threshold
-        q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
+        xp = namespace(matrix)
+        q = xp.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         a = q * expectation.hazard * self.sensors.deviation
         noise = q * variance + q * (1.0 - q) * (k3 * moments + k8 * threshold**2)
         if self.event_error is not None:
@@ -233,11 +237,12 @@ class BoundTobitFilter:
         """
         k1, k2, _, k4, k5, _, k7, _ = self.constants.kappa
         threshold = self.sensors.finite_threshold
-        q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
+        xp = namespace(matrix)
+        q = xp.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         bias = expectation.hazard * self.sensors.deviation
         core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
         ridge = linalg.diagonal(core)
-        core = linalg.add_diagonal(core, np.where(ridge > _LEAST, _RIDGE * ridge, 1.0))
+        core = linalg.add_diagonal(core, xp.where(ridge > _LEAST, _RIDGE * ridge, 1.0))
         columns = _pinned_columns(held, threshold, q, np.sqrt(k5), np.sqrt(k7))
         whitened, pull = _pinned_solve(core, matrix, columns)
         across = linalg.transpose(matrix)
@@ -258,25 +263,26 @@ def _pinned_columns(
     ȳ_p u - u_p ȳ = (e_p τ - τ_p e) - q ȳ_p τ + q_p τ_p ȳ with e = ȳ - τ, which loses no digits
     where ȳ lies at the threshold and q is tiny.
     """
-    floored = np.maximum(q, _SMALLEST_DIVISOR)
+    xp = namespace(held, q)
+    floored = xp.maximum(q, _SMALLEST_DIVISOR)
     if not np.any(threshold):
         return [(a * held / floored, np.full(held[..., :1, :].shape, 1.0 / a))]
     u = (1.0 - q) * threshold
-    size = np.hypot(a * held, b * u)
-    row = np.argmax(size / floored, axis=-2)[..., None, :]
+    size = xp.hypot(a * held, b * u)
+    row = xp.argmax(size / floored, axis=-2)[..., None, :]
 
     def at_row(values: Array) -> Array:
-        return np.take_along_axis(np.broadcast_to(values, size.shape), row, axis=-2)
+        return xp.take_along_axis(xp.broadcast_to(values, size.shape), row, axis=-2)
 
     radius = at_row(size)
-    radius = np.where(radius > 0.0, radius, 1.0)
+    radius = xp.where(radius > 0.0, radius, 1.0)
     held_p, u_p, q_p, threshold_p = at_row(held), at_row(u), at_row(q), at_row(threshold)
     above = held - threshold
     above_p = at_row(above)
     crossed = (above_p * threshold - threshold_p * above) / floored
     crossed += q_p / q * threshold_p * held - held_p * threshold
     crossed *= a * b / radius
-    np.put_along_axis(crossed, row, 0.0, axis=-2)
+    crossed = xp.where(np.arange(size.shape[-2])[:, None] == row, 0.0, crossed)
     first = (a * a * held_p * held + b * b * u_p * u) / (radius * floored)
     return [
         (first, (above_p + q_p * threshold_p) / radius),
@@ -294,14 +300,14 @@ def _pinned_solve(
     (M + f fᵀ)⁻¹ = M⁻¹ - h hᵀ/(1 + fᵀ h), and (M + f fᵀ)⁻¹ f = h/(1 + fᵀ h). It is written with f of
     unit size, for fᵀ h may overflow.
     """
-    n = right.shape[-2]
+    xp, n = namespace(core, right), right.shape[-2]
     # Powers of two, which no rounding depends on.
-    exponents = [math.frexp(float(np.abs(f).max()))[1] for f, _ in columns]
-    sizes = [2.0 ** max(exponent, -400) for exponent in exponents]
+    exponents = [xp.frexp(xp.abs(f).max())[1] for f, _ in columns]
+    sizes = [xp.ldexp(1.0, xp.maximum(exponent, -400)) for exponent in exponents]
     units = [f / size for (f, _), size in zip(columns, sizes, strict=True)]
-    stacked = np.concatenate([right, *(unit[..., None, :] for unit in units)], axis=-2)
+    stacked = xp.concatenate([right, *(unit[..., None, :] for unit in units)], axis=-2)
     solved = linalg.solve(core, stacked)
-    shift = np.zeros_like(units[0])
+    shift = xp.zeros_like(units[0])
     for place, (unit, size, (_, factor)) in enumerate(zip(units, sizes, columns, strict=True)):
         h = solved[..., n + place, :]
         weight = h / (size**-2.0 + linalg.dot(unit, h))[..., None, :]

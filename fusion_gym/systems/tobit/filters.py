@@ -117,10 +117,8 @@ def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tup
         form = linalg.gram(xp.concatenate(parts, axis=-2))
         return (linalg.add_diagonal(form, size * _RIDGE * linalg.diagonal(form)),)
 
-    noise = xp.broadcast_to(noise, matrix.shape[:-2] + matrix.shape[-1:])
     arguments = (correction, matrix, noise) if bias is None else (correction, matrix, noise, bias)
-    runs = large.reshape(-1, large.shape[-1]).any(0)
-    (posterior,) = in_runs(runs, exact, arguments, (posterior,))
+    (posterior,) = in_runs(large, exact, arguments, (posterior,))
     return correction, posterior
 
 
@@ -148,6 +146,9 @@ class Scalar(NamedTuple):
         """Return a root of P - P cᵀ c P s/S, s the share of variance that the measurement explains.
 
         It is G (I - w g gᵀ) with (1 - w gᵀ g)² = 1 - s gᵀ g/S, which loses no digits for any P.
+
+        Source: J. E. Potter's form; P. S. Maybeck, "Stochastic models, estimation, and control",
+        volume 1, 1979, section 7.3.
         """
         left = share * self.noise + (1.0 - share) * self.variance
         weight = share / (self.variance + namespace(left).sqrt(left * self.variance))
@@ -173,7 +174,7 @@ def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
         total = linalg.matmul(linalg.transpose(matrix), both)
     covariance = linalg.inverse(linalg.identity(size) + total[..., :size, :])
     mean = linalg.matvec(covariance, total[..., size, :])
-    large = ((matrix * matrix).sum(-2) > _STARVED).reshape(-1, matrix.shape[-1]).any(0)
+    large = (matrix * matrix).sum(-2) > _STARVED
     results = in_runs(large, _sequential_update, (matrix, value), (mean, covariance))
     return results[0], results[1]
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, FederatedCentre, Feedback
 from fusion_gym.systems.tobit.filters import KalmanFilter, joint_update
 from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
@@ -52,21 +53,22 @@ class JointCentre(FederatedCentre):
         granted: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
-        sensors, runs = self.sensors, granted.shape[-1]
-        (channels,) = np.nonzero(np.repeat(granted.any(-1), sensors.size))
+        xp, sensors, runs = namespace(granted), self.sensors, granted.shape[-1]
+        every = xp.repeat(granted, sensors.size, axis=0)
+        channels = active_rows(every)
         if not channels.size:
             return mean, covariance
-        taken = np.repeat(granted, sensors.size, axis=0)[channels].astype(np.float64)
+        taken = every[channels].astype(np.float64)
         innovation = (measurement - prediction.expectation.value).reshape(-1, runs)[channels]
         # A channel that has not arrived stands for nothing, with a variance of 1.
         noise = taken[:, None] * taken * sensors.noise_covariance[np.ix_(channels, channels)]
         matrix = linalg.matmul(sensors.stacked_matrix[channels], prediction.root)
-        both = taken[:, None] * np.concatenate([matrix, innovation[:, None]], axis=1)
+        both = taken[:, None] * xp.concatenate([matrix, innovation[:, None]], axis=1)
         both = linalg.whiten(linalg.add_diagonal(noise, 1.0 - taken), both)
         shift, posterior = joint_update(both[:, :-1], both[:, -1])
         posterior = linalg.congruence(prediction.root, posterior)
         mean = mean + linalg.matvec(prediction.root, shift)
-        return mean, np.where(granted.any(0), posterior, covariance)
+        return mean, xp.where(granted.any(0), posterior, covariance)
 
     local_means = Centre.local_means
 
