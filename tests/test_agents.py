@@ -62,11 +62,11 @@ def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
 
 UNREADABLE = {
     "absent": (None, r"unreadable\.yaml"),
-    "half": (b"a: [1,", "no YAML"),
-    "bytes": (b"\xff\xfe\x00", "no text in UTF-8"),
+    "half": (b"a: [1,", "not YAML"),
+    "bytes": (b"\xff\xfe\x00", "not UTF-8 text"),
     "twice": (
         b"a: &base {seed: 1}\nb:\n  <<: *base\n  seed: 2\nc:\n  seed: 1\n  seed: 2\n",
-        r"the key 'seed' is given twice.*line 7|line 7.*the key 'seed' is given twice",
+        r"the key 'seed' appears twice.*line 7|line 7.*the key 'seed' appears twice",
     ),
 }
 

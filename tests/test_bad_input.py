@@ -291,11 +291,11 @@ CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
         (TOBIT, {}, "rollout", ("policy 'rollout' needs a parameter 'base': write base=",)),
         (TOBIT, {}, "rollout:base=always:samples=3", ("of policy 'always' 'samples'",)),
         (TOBIT, {}, "rollout:steps=0,base=never", ("steps = 0",)),
-        (TOBIT, {}, "rollout:base=dynamic_event", ("'dynamic_event'", "the present step alone")),
+        (TOBIT, {}, "rollout:base=dynamic_event", ("'dynamic_event'", "of the present step")),
         (TOBIT, {}, "rollout:base=rollout:base=never", ("base = 'rollout:base=never'",)),
         (TOBIT, {}, "rollout:base=value_of_information:own=true", ("a scheduler's policy",)),
         (TOBIT, CENTRE, "rollout:base=never", ("information = 'centre'",)),
-        (TOBIT, {}, f"{VALUE}:threshold=0.1,price=0.1", ("price = 0.1", "beside threshold")),
+        (TOBIT, {}, f"{VALUE}:threshold=0.1,price=0.1", ("price = 0.1", "with threshold")),
         (TOBIT, {}, f"{VALUE}:own=true,at_most=2", ("at_most = 2", "own=True")),
         (TOBIT, {}, f"{VALUE}:own=true,steps=2", ("steps = 2", "own=True")),
         (TOBIT, {}, "estimate_difference:own=true,at_most=2", ("at_most = 2", "own=True")),
@@ -305,7 +305,7 @@ CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
         (MARKOV, {}, f"{OPTIMUM}:packets=12,period=8", ("packets = 12", "2704156 schedules")),
         (MARKOV, {}, f"{OPTIMUM}:cache=/dev/null/x,packets=1,period=1", ("cache = ", "written")),
         (MARKOV, {"access": "single"}, OPTIMUM, ("access = 'single'", "'any'")),
-        (MARKOV, {"filter": "imm"}, OPTIMUM, ("CentralSystem", "not depend on the data")),
+        (MARKOV, {"filter": "imm"}, OPTIMUM, ("CentralSystem", "depend only on deliveries")),
     ],
 )
 def test_policies_elsewhere(

@@ -102,12 +102,12 @@ class Rollout:
             raise validation.refusal(
                 "base",
                 base,
-                "a policy that looks at the signals of the present step alone, for it is asked in "
-                "the middle of simulated episodes",
+                "a policy that reads only signals of the present step, because simulated "
+                "episodes call it",
             )
         if owner_of(self.base) == "own":
             raise validation.refusal(
-                "base", base, "a scheduler's policy, for simulations begin with what it believes"
+                "base", base, "a scheduler's policy, because simulations begin with its belief"
             )
         memory = Memory(task, "scheduler")
         self._task = task

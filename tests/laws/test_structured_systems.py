@@ -170,7 +170,7 @@ def test_the_longest_horizon_is_named_and_right(growth: float) -> None:
     found = re.search(r"at most (\d+)", str(error.value))
     assert found
     longest = int(found[1])
-    with pytest.warns(UserWarning, match="float64 holds means only to about"):
+    with pytest.warns(UserWarning, match="rounding errors may reach"):
         make_task("fusion_gym/LinearFusion-v2", horizon=longest, **options)
     with pytest.raises(ConfigurationError, match="horizon"):
         make_task("fusion_gym/LinearFusion-v2", horizon=longest + 1, **options)
