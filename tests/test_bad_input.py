@@ -111,7 +111,7 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("RemoteEstimation", {"token_capacity": 0.5}, ("token_capacity = 0.5", "initial_tokens = 1.0")),
     ("RemoteEstimation", {"coefficient": 9.0}, ("coefficient = 9.0", "horizon = 200", "1e+32")),
     ("CorrelatedTracking", {"token_capacity": 3.5}, ("= 3.5", "initial_tokens = 10.0")),
-    ("UnknownInput", {"input_amplitude": 0.0}, ("input_amplitude = 0.0", "nothing to estimate")),
+    ("UnknownInput", {"input_amplitude": 0.0}, ("input_amplitude = 0.0", "differ from zero")),
     ("BiasedOscillator", {"censoring_threshold": 1e9}, ("1000000000.0", "censoring_upper")),
     ("BiasedOscillator", {"censoring_threshold": 5.0}, ("is not allowed",)),
     ("BiasedOscillator", {"bias_gain": [[0.1]]}, ("is not allowed",)),

@@ -304,7 +304,7 @@ def test_a_file_that_decides_otherwise_is_not_kept(
 
     monkeypatch.setattr("fusion_gym.evaluation.onnx_export.save_graph", wrong)
     with pytest.raises(
-        ConfigurationError, match=r"is not exported: [\d,]+ of .* are decided otherwise"
+        ConfigurationError, match=r"is not exported: file .* [\d,]+ of .* observations, and"
     ):
         command("zoo:tobit_oscillator_centre,price=0.1", path)
     assert path.read_text() == "kept"
