@@ -121,7 +121,7 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     os.kill(process.pid, number)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
-    message, again = error.decode().splitlines()[-1].split("go on with: ")
+    message, again = error.decode().splitlines()[-1].split("continue with: ")
     assert message == "interrupted; "
     assert shlex.split(again) == ["fusion-gym", *command[3:], "--resume"]
     summary = json.loads((folder / "summary.json").read_text())

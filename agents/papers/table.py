@@ -37,7 +37,7 @@ class Table(Long):
     seed: Seed = 0
     """Seed of the first episode."""
     markdown: bool = False
-    """Print the table as the documentation holds it."""
+    """Print the table in the documentation's format."""
 
     keeps = False
 

@@ -98,8 +98,8 @@ def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, 
         config_file = Path(name).parent / "config.yaml"
         if not config_file.is_file():
             raise ConfigurationError(
-                f"env = None is not allowed with model = {command.model!r}, beside which lies no "
-                "config.yaml of its training: give --env ID or --config FILE"
+                f"env = None is not allowed with model = {command.model!r}, whose folder has no "
+                "config.yaml: give --env ID or --config FILE"
             )
         config = str(config_file)
     env_id, options, _ = environment_of(command.env, config, command.options)

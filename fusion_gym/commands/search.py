@@ -108,7 +108,8 @@ class Search(EnvironmentOptions, Long):
         if not self.resume:
             if path.exists() or (self.output / _RESULT).exists():
                 raise ConfigurationError(
-                    f"{place} holds a search already: go on with --resume, or give another --output"
+                    f"{place} already holds a search: continue with --resume, or give another "
+                    "--output"
                 )
             return []
         if not path.exists():

@@ -22,7 +22,7 @@ _LANES = 16384  # simulations in one batch, unless one run needs more
 
 
 class Rollout:
-    r"""Request the best first decision in simulations that continue with the policy ``base``.
+    r"""Request by the best first decision of simulations that continue with the policy `base`.
 
     At every step the first decisions are silence, each single sensor, and the base's requests.
     After each of them the base continues for ``steps`` steps, in ``samples`` simulations. The
