@@ -70,8 +70,9 @@ def export(command: Export) -> list[str]:
         f"{command.model} is in {command.onnx}: {model.size:,} bytes",
         f"from {text}",
         f"to {answers}",
-        f"as the agent on {result.observations:,} observations of {result.episodes:,} episodes of "
-        f"{env_id}: all decisions agree, numbers differ by {result.difference:.2g} at most",
+        f"against the agent on {result.observations:,} observations of {result.episodes:,} "
+        f"episodes of {env_id}: all decisions agree, numbers differ by at most "
+        f"{result.difference:.2g}",
         f"one decision on one thread here: {1e6 * model.latency.median:.1f} µs in the median, 99 % "
         f"below {1e6 * model.latency.most:.1f} µs",
     ]

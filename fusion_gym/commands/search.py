@@ -97,7 +97,7 @@ class Search(EnvironmentOptions, Long):
 
             def progress(generation: Generation) -> None:
                 keep(generation)
-                bar.say(f"best {min(generation.objectives) - 1.0:+.1%} of a single threshold")
+                bar.say(f"best {min(generation.objectives) - 1.0:+.1%} over a single threshold")
                 bar.update()
 
             return search_rule(search, tuple(generations), progress)

@@ -32,7 +32,7 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     specs = envs.get_attr("spec")
     spec = specs[0]
     if spec is None:
-        raise ConfigurationError("environments in one batch must be made by gym.make")
+        raise ConfigurationError("gym.make must create the environments of one batch")
     base, _ = base_of(spec.id)  # the specification has the options too
     if any(_spec_key(other) != _spec_key(spec) for other in specs):
         raise ConfigurationError(
