@@ -98,7 +98,7 @@ class Cache:
 
 
 def _refuse() -> None:
-    raise FileNotFoundError("the result is not there")
+    raise FileNotFoundError("the result is absent")
 
 
 def _key(function: Function, inputs: Inputs) -> str:

@@ -42,8 +42,8 @@ class Pool:
     def __post_init__(self) -> None:
         if self.address is not None and self.backend == "loky":
             raise ConfigurationError(
-                f"address = {self.address!r} is not allowed with backend='loky', which has none: "
-                "it belongs to 'dask'"
+                f"address = {self.address!r} is not allowed with backend='loky': it belongs to "
+                "'dask'"
             )
 
     @property
@@ -136,8 +136,8 @@ def run_parallel(work: Sequence[Call], pool: Pool, description: str) -> list[Any
                 bar.reach(len(work) - len(left), 1.0 - rest / total)
         except BrokenProcessPool:
             raise ConfigurationError(
-                f"workers = {pool.workers}: the system ended one of them, perhaps for want of "
-                "memory; finished pieces of work are kept: go on as after an interrupt"
+                f"workers = {pool.workers}: the system ended one of them; the memory may be full. "
+                "Finished pieces of work are saved: continue as after an interrupt"
             ) from None
     return results
 

@@ -37,7 +37,7 @@ class Run:
 def main() -> None:
     """Run missing commands, then write tables and figures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--resume", action="store_true", help="keep the commands that have ended")
+    parser.add_argument("--resume", action="store_true", help="keep finished commands")
     parser.add_argument("--folder", type=Path, default=Path("runs/newcomer"))
     arguments = parser.parse_args()
     if not arguments.resume:

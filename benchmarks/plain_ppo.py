@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, default=300_000)
     parser.add_argument("--gamma", type=float, default=0.9)
     parser.add_argument("--n-steps", type=int, default=32)
-    parser.add_argument("--resume", action="store_true", help="go on with what is there")
+    parser.add_argument("--resume", action="store_true", help="continue from the existing results")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     heads = "setting", "best simple rule", "best rule", *TRAININGS, "CPU s"

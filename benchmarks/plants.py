@@ -82,11 +82,11 @@ def main() -> None:
     parser.add_argument("plants", nargs="*", metavar="PLANT", help="all by default")
     parser.add_argument("--output", type=Path, default=Path("runs/plants"))
     parser.add_argument("--episodes", type=int, default=300)
-    parser.add_argument("--timesteps", type=int, help="in the place of the config's")
-    parser.add_argument("--resume", action="store_true", help="go on with what is there")
+    parser.add_argument("--timesteps", type=int, help="instead of the config's timesteps")
+    parser.add_argument("--resume", action="store_true", help="continue from the existing results")
     arguments = parser.parse_args()
     heads = "plant", "CPU s", "least sent", "most sent", "mean", "least", "most"
-    table = Table(*heads, title="cost of the agent over the best rule's; negative: it is better")
+    table = Table(*heads, title="agent's cost over the best rule's; negative: the agent is better")
     with report_errors():
         for name in arguments.plants or PLANTS:
             choice("plant", name, PLANTS)

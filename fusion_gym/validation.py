@@ -162,7 +162,7 @@ def read_text(field: str, path: Path, name: str | None = None) -> str:
             raise ValueError(f"it has more than {LONGEST_TEXT:,} characters")
         return text
     except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{field} = {label!r} is no text in UTF-8: {error}") from None
+        raise ConfigurationError(f"{field} = {label!r} is not UTF-8 text: {error}") from None
     except (OSError, ValueError) as error:  # an invalid path raises a ValueError
         reason = getattr(error, "strerror", None) or error
         raise ConfigurationError(f"{field} = {label!r} cannot be read: {reason}") from None

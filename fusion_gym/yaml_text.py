@@ -40,7 +40,7 @@ class _Loader(yaml.SafeLoader):
                 continue
             key = self.construct_object(key_node, deep=True)
             if isinstance(key, Hashable) and key in visited:
-                raise _problem(f"the key {key!r} is given twice", key_node)
+                raise _problem(f"the key {key!r} appears twice", key_node)
             visited.add(key)
         return super().construct_mapping(node, deep)
 
@@ -64,7 +64,7 @@ def parsed(text: str, source: str) -> Any:
     # PyYAML's types raise other errors, such as for a date of 31 February.
     except (yaml.YAMLError, ValueError, AttributeError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise ConfigurationError(f"{source} is no YAML: {reason}") from None
+        raise ConfigurationError(f"{source} is not YAML: {reason}") from None
     for key, part in nested(source, result):
         if isinstance(part, str) and _CONTROL.search(key + part):
             raise refusal(f"{source}: {key}", part, "text without control characters")

@@ -361,7 +361,7 @@ class Survey:
         self.drawn += 1
         try:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message=".*float64 holds means only")
+                warnings.filterwarnings("ignore", message=".*rounding errors may reach")
                 task = make_task(drawn.env_id, **drawn.options)
         except ConfigurationError as error:
             self.refused[reason(str(error))] += 1

@@ -62,11 +62,11 @@ def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
 
 UNREADABLE = {
     "absent": (None, r"unreadable\.yaml"),
-    "half": (b"a: [1,", "no YAML"),
-    "bytes": (b"\xff\xfe\x00", "no text in UTF-8"),
+    "half": (b"a: [1,", "not YAML"),
+    "bytes": (b"\xff\xfe\x00", "not UTF-8 text"),
     "twice": (
         b"a: &base {seed: 1}\nb:\n  <<: *base\n  seed: 2\nc:\n  seed: 1\n  seed: 2\n",
-        r"the key 'seed' is given twice.*line 7|line 7.*the key 'seed' is given twice",
+        r"the key 'seed' appears twice.*line 7|line 7.*the key 'seed' appears twice",
     ),
 }
 
@@ -121,7 +121,7 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     os.kill(process.pid, number)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
-    message, again = error.decode().splitlines()[-1].split("go on with: ")
+    message, again = error.decode().splitlines()[-1].split("continue with: ")
     assert message == "interrupted; "
     assert shlex.split(again) == ["fusion-gym", *command[3:], "--resume"]
     summary = json.loads((folder / "summary.json").read_text())

@@ -68,7 +68,7 @@ def test_no_output_replaces_an_input(here: Path) -> None:
     config = "id: fusion_gym/RemoteEstimation-v1\n"
     for name, message in (
         ("config.yaml", "it must be a file that ends with .json"),
-        ("config.json", "it must be another file than that of config"),
+        ("config.json", "it must be another file than config"),
     ):
         Path(name).write_text(config)
         error = refusal("evaluate", ["--config", name, "--policies", "always", "--json", name])

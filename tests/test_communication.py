@@ -119,7 +119,7 @@ def test_a_single_sensor_cannot_send_the_schedulers_estimate() -> None:
     ):
         with pytest.raises(ConfigurationError, match=message):
             make()
-    with pytest.raises(ConfigurationError, match=r"packet = 'estimate' .*by themselves"):
+    with pytest.raises(ConfigurationError, match=r"packet = 'estimate' .*local sensors"):
         EpisodeBatch.seeded(fusion_gym.make_task(CORRELATED, **options), 1, 0, "own")
 
 

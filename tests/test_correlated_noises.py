@@ -132,8 +132,8 @@ def test_the_bounds_floor_counts_what_is_shared() -> None:
         ({"filter": "adf"}, "'joint' or 'kalman'"),
         ({"memory": True, "memory_filter": "adf"}, "memory_filter"),
         ({"filter": "joint", "fusion": "ci"}, "a filter with nodes"),
-        ({"censoring_threshold": [0.0, -np.inf, -np.inf]}, "for some of them are censored"),
-        ({"censoring_upper": [5.0, [4.0, np.inf], np.inf]}, "sensor 1, which is censored"),
+        ({"censoring_threshold": [0.0, -np.inf, -np.inf]}, "because some are censored"),
+        ({"censoring_upper": [5.0, [4.0, np.inf], np.inf]}, "the censored sensor 1"),
     ],
 )
 def test_what_would_not_stay_right_is_refused(options: dict[str, Any], message: str) -> None:

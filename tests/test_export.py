@@ -167,7 +167,7 @@ def test_agents_of_the_zoo_are_exported_with_what_they_see(name: str, tmp_path: 
     path = tmp_path / "agent.onnx"
     lines = command(f"zoo:{name}", path)
     assert f"{path.stat().st_size:,} bytes" in lines[0]
-    assert re.search(r"as the agent on 10,[\d]{3} observations of \d+ episodes", lines[3])
+    assert re.search(r"against the agent on 10,[\d]{3} observations of \d+ episodes", lines[3])
     assert "all decisions agree" in lines[3]
     assert "µs in the median" in lines[4]
     trained = zoo.card(name)["training"]["environment"]
@@ -304,7 +304,7 @@ def test_a_file_that_decides_otherwise_is_not_kept(
 
     monkeypatch.setattr("fusion_gym.evaluation.onnx_export.save_graph", wrong)
     with pytest.raises(
-        ConfigurationError, match=r"is not exported: [\d,]+ of .* are decided otherwise"
+        ConfigurationError, match=r"is not exported: file .* [\d,]+ of .* observations, and"
     ):
         command("zoo:tobit_oscillator_centre,price=0.1", path)
     assert path.read_text() == "kept"

@@ -60,7 +60,7 @@ def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) 
     [
         (b"", "holds no JSON: "),
         (b'{"a": 1', "holds no JSON: "),
-        (b"\xff\xfe", "is no text in UTF-8: "),
+        (b"\xff\xfe", "is not UTF-8 text: "),
         (b"[1]", "holds no JSON object"),
         (None, "cannot be read: No such file or directory"),
     ],

@@ -104,7 +104,7 @@ def test_all_alternatives_are_those_of_few_sensors(action: str) -> None:
 
     assert decisions(10).choices == 1024
     instead = "'flips'" if action == "binary" else "'binary'"
-    with pytest.raises(ConfigurationError, match=rf"11 sensors: all 2\^11 .*{instead}"):
+    with pytest.raises(ConfigurationError, match=rf"11 sensors: it steps all 2\^11 .*{instead}"):
         decisions(11)
 
 

@@ -245,8 +245,8 @@ def with_policy(**kwargs: Any) -> Recipe:
 @pytest.mark.parametrize(
     ("recipe", "reason"),
     [
-        (FOREIGN, "its policy is none of"),
-        (Recipe(PPO, OwnPolicy), "its policy is none of"),
+        (FOREIGN, "its policy belongs to none of"),
+        (Recipe(PPO, OwnPolicy), "its policy belongs to none of"),
         (with_policy(features_extractor_class=OwnExtractor), "features_extractor_class"),
         (with_policy(activation_fn=torch.nn.Softplus), "Softplus"),
     ],
@@ -283,7 +283,7 @@ HEAD, FIRST = "action_net.weight", "mlp_extractor.policy_net.0.weight"
         (lambda weights: weights | {HEAD: weights[HEAD][:2]}, "--trust"),
         (lambda weights: weights | {HEAD: weights[HEAD].to_sparse()}, "--trust"),
         (lambda weights: weights | {HEAD: torch.zeros(1).expand(10**6, 10**6)}, "bytes"),
-        (lambda weights: weights | {FIRST: torch.zeros(1).expand(10**7, 1)}, "do not fit"),
+        (lambda weights: weights | {FIRST: torch.zeros(1).expand(10**7, 1)}, "disagree"),
         (lambda weights: weights | {HEAD: weights[HEAD] * torch.nan}, "not finite"),
         (lambda weights: [weights], "--trust"),
         (lambda weights: dict.fromkeys(map(str, range(2000)), torch.zeros(1)), "--trust"),
@@ -313,8 +313,8 @@ def test_files_that_hold_no_fitting_agent(saved: Callable[[str], Saved], tmp_pat
     centre = fusion_gym.make_task(ENV, **OPTIONS, information="centre")
     for path, parts in (
         (tmp_path, ["no such file"]),
-        (text, ["no Stable-Baselines3 model"]),
-        (empty, ["no Stable-Baselines3 model (it has no data)"]),
+        (text, ["not a Stable-Baselines3 model"]),
+        (empty, ["not a Stable-Baselines3 model (it has no data)"]),
         (agent.plain, ["layout", str(agent.model.observation_space.shape)]),
         (agent.carded, ["layout", "whitened_innovation[0,0]"]),
     ):
@@ -374,7 +374,7 @@ def test_a_damaged_file_is_refused_or_harmless(
     agent, path, stream = saved("ppo"), tmp_path / "damaged.zip", random.Random(0)
     whole = agent.carded.read_bytes()
     repacked(path, agent.carded, data=b"[" * 100_000)
-    with pytest.raises(ConfigurationError, match="its data is no JSON"):
+    with pytest.raises(ConfigurationError, match="its data is not JSON"):
         make_policy(f"model:{path}", agent.task)
     text = []
     for trial in range(40):

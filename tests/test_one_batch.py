@@ -66,8 +66,8 @@ def test_what_one_batch_would_lose_is_refused() -> None:
         (make_vec_env("CartPole-v1", 2), "environment 'CartPole-v1' is not allowed"),
         (make_vec_env(wrapped, 2), r"wrappers \['TransformReward'\] are not allowed"),
         (make_vec_env(TOBIT, 1, env_kwargs={"render_mode": "human"}), "render_mode = 'human'"),
-        (DummyVecEnv([lambda: gym.make(TOBIT), lambda: gym.make(TOBIT, horizon=3)]), "made alike"),
-        (DummyVecEnv([lambda: gym.make(TOBIT).unwrapped.__class__()]), "made by gym.make"),
+        (DummyVecEnv([lambda: gym.make(TOBIT), lambda: gym.make(TOBIT, horizon=3)]), "be the same"),
+        (DummyVecEnv([lambda: gym.make(TOBIT).unwrapped.__class__()]), "gym.make must"),
     ):
         with pytest.raises(ConfigurationError, match=message):
             one_batch(envs)

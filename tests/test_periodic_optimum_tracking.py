@@ -195,5 +195,5 @@ def test_brute_force_of_uncensored_nodes(name: str) -> None:
     ids=["paper", "hold", "tobit", "adf", "upper", "lower", "remote"],
 )
 def test_other_filters_of_the_same_systems_are_refused(task: Task) -> None:
-    with pytest.raises(ConfigurationError, match=r"System.* not depend on the data"):
+    with pytest.raises(ConfigurationError, match=r"System.* depend only on deliveries"):
         PeriodicOptimum(task, 1, 1)

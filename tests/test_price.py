@@ -105,7 +105,7 @@ def test_rewards_of_a_training_over_prices_are_scaled_and_returns_are_not(local:
 
 
 RANGE = "it must be a pair (low, high) with 0 < low < high"
-KINDS = "it must be one of 'squared', 'trace', 'maximum', a function, or 'module:name' of one"
+KINDS = "it must be one of 'squared', 'trace', 'maximum', a function, or its 'module:name'"
 
 
 @pytest.mark.parametrize(("options", "message"), [
@@ -121,8 +121,8 @@ KINDS = "it must be one of 'squared', 'trace', 'maximum', a function, or 'module
     ({"error": np.zeros(0)}, f"error = [] is not allowed: {KINDS}"),
     ({"error": "cubed"}, f"error = 'cubed' is not allowed: {KINDS}"),
     ({"error": lambda error, covariance: 0.0 * error[0] - 1.0},
-     "error = 'test_price:<lambda>' is not allowed: of errors (2, 3) it must return numbers "
-     ">= 0 of shape (3,), and returned [-1.0, -1.0, -1.0] of shape (3,)"),
+     "error = 'test_price:<lambda>' is not allowed: for errors (2, 3) it must return numbers "
+     ">= 0 of shape (3,), but it returned [-1.0, -1.0, -1.0] of shape (3,)"),
     ({"error": "os:system"},
      "error = 'os:system' is not allowed: it must take errors (n, N) and covariances (n, n, N), "
      "and return numbers >= 0 (N,) (TypeError: system() takes at most 1 argument (2 given))"),
@@ -136,7 +136,7 @@ def test_a_reward_that_cannot_be_is_refused(options: dict[str, Any], message: st
 def test_open_loop_costs_one_with_equal_weights() -> None:
     variances = np.array([0.5, 2.0, 8.0])
     np.testing.assert_allclose(equal_weights(variances) * variances, 1.0 / 3.0)
-    ending = "every state must be moved by noise before the horizon, or be uncertain at the start"
+    ending = "every state must have noise before the horizon, or an uncertain start"
     with pytest.raises(ConfigurationError, match=f"^a squared error of .0.0. without .*{ending}$"):
         equal_weights(np.zeros(1))
     with pytest.raises(ConfigurationError, match=r"^price_range = None .* observed$"):

@@ -113,7 +113,7 @@ def test_an_interrupted_evaluation_says_how_to_go_on(
     assert (ended.status, ended.trace) == (130, "")
     assert ended.err.splitlines()[0] == f"writing the results of each policy into {file}"
     message, again = ended.err.splitlines()[-1].split(": ", 1)
-    assert message == "interrupted; go on with"
+    assert message == "interrupted; continue with"
     assert list(json.loads(file.read_text())["policies"]) == ["always"]
     program, name, *words = shlex.split(again)
     assert (program, name) == ("fusion-gym", "evaluate")
@@ -129,7 +129,7 @@ def test_an_interrupt_that_loses_all_says_so(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(evaluate, "run_episodes", run_episodes)
     ended = call("evaluate", EVALUATE)
     assert (ended.status, ended.err.splitlines()[-1]) == (
-        130, "interrupted: nothing is kept (--json FILE keeps finished policies)",
+        130, "interrupted: nothing is saved (--json FILE saves finished policies)",
     )  # fmt: skip
     absent = call("train", ["--config", "tobit_oscillator_ppo", "--output", "absent", "--resume"])
     assert absent.err == "error: output = 'absent' holds no training: nothing to resume\n"

@@ -87,7 +87,7 @@ def test_a_maker_is_given_the_task_and_says_what_is_missing(task: Task) -> None:
         make_policy("gains", task)
     register_policy("shapeless", lambda: Steady("clock"))
     register_policy("undeclared", lambda: Steady(None))
-    with pytest.raises(ConfigurationError, match=r"knowledge = None: it must declare .* 'clock'"):
+    with pytest.raises(ConfigurationError, match=r"knowledge = None: it must be .* 'clock'"):
         make_policy("undeclared", task)
 
     class Flat(Mine):
@@ -112,7 +112,7 @@ def test_a_parameter_that_a_rule_cannot_have_is_refused_by_name(name: str, value
 @pytest.mark.parametrize(
     ("name", "maker", "message"),
     [
-        ("always", Mine, "there is a policy of that name"),
+        ("always", Mine, "a policy has this name"),
         ("my-rule", Mine, "name = 'my-rule'"),
         ("mine", "module:Mine", "'module:Mine' .* must be a callable"),
         ("mine", lambda *values: Mine(), "named parameters"),

@@ -179,7 +179,7 @@ def test_two_trainings_in_one_folder_are_refused(
 
     def log_line(_: Any) -> str:
         for resume, message in (
-            (False, "holds a training already"),
+            (False, "already holds a training"),
             (True, "is in use by another"),
         ):
             with pytest.raises(ConfigurationError, match=message) as caught:
@@ -228,7 +228,7 @@ def test_two_trainings_in_one_folder_are_refused(
                 "environment": {"id": ENV, "local": True},
                 "algorithm": {"name": "counterfactual_ppo", "alternatives": "all"},
             },
-            "sensors decide by themselves",
+            "sensors decide locally",
         ),
         ({"training": SHORT | {"error": "mismatch", "error_filter": "none such"}}, "filter"),
         ({"training": SHORT | {"error_filter": "adf"}}, "error_filter"),

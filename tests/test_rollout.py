@@ -178,5 +178,5 @@ def test_the_base_is_the_rest_of_the_text() -> None:
 
 def test_an_input_that_is_the_same_in_every_episode_cannot_be_imagined() -> None:
     task = fusion_gym.make_task(INPUT, input_phase=(0.0, 1.0), horizon=5)
-    with pytest.raises(ConfigurationError, match="UnknownInputSystem cannot be imagined here"):
+    with pytest.raises(ConfigurationError, match="UnknownInputSystem is not allowed here"):
         make_policy("rollout:base=never", task)

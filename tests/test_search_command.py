@@ -116,10 +116,10 @@ def test_an_interrupted_search_ends_as_the_uninterrupted_one(
         patch.setattr(command, "search_rule", interrupt)
         ended = call("search", words("parts"))
     assert ended.status == 130
-    assert ended.err.splitlines()[-1].startswith("interrupted; go on with: fusion-gym search --env")
+    assert ended.err.splitlines()[-1].startswith("interrupted; continue with: fusion-gym search ")
     assert ended.err.splitlines()[-1].endswith("--resume")
     assert not Path("parts/search.json").exists()
-    assert "holds a search already" in refusal("search", words("parts"))
+    assert "already holds a search" in refusal("search", words("parts"))
     succeed("search", words("parts", "--resume"))
     assert contents("parts") == contents("whole")
     succeed("search", words("whole", "--resume"))  # nothing is left to do
@@ -132,7 +132,7 @@ def test_what_a_search_refuses() -> None:
     assert not Path("made").exists()
     succeed("search", words("made"))
     before = contents("made")
-    assert "output = 'made' holds a search already" in refusal("search", words("made"))
+    assert "output = 'made' already holds a search" in refusal("search", words("made"))
     other = words("made", "--class", "local", "--resume")
     assert "class = 'local' differs" in refusal("search", other)
     path = Path("made/generations.json")

@@ -196,7 +196,7 @@ def test_no_turn_is_lost_in_the_end_unless_cheaper_sensors_are_favoured(
     ("options", "message"),
     [
         ({"token_capacity": 8.0, "initial_tokens": 1.0, "sharing": "turns"}, "below 9, the cost"),
-        ({"access": "round_robin", "token_rate": 1.0}, "some of the 3 sensors more often"),
+        ({"access": "round_robin", "token_rate": 1.0}, "favour some of the 3 sensors"),
         ({"access": "round_robin", "token_rate": 1.0, "token_cost": [1, 3, 3]}, "dearer sensors"),
         ({"access": "random", "token_rate": 1.0, "token_cost": [1, 3, 3]}, "dearer sensors"),
     ],

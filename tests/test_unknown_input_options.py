@@ -116,7 +116,7 @@ DRIFTING = (((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 1.0, 0.0)),) * 3
                 "transition": np.eye(4),
                 "input_matrix": np.eye(4)[:, 1:2],
             },
-            "process_covariance = .* moved by the input",
+            "process_covariance = .* have an input",
         ),
         ({"input_signal": np.ones((101, 1)), "input_period": 3.0}, "input_period = 3.0"),
         ({"input_signal": "steps", "input_period": 0.5}, r"input_period .* >= 1"),

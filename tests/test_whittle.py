@@ -94,5 +94,5 @@ def test_what_it_asks_for() -> None:
             make_policy(text, task)
     with pytest.raises(ConfigurationError, match=r"coefficient = 1\.2 of source 0"):
         make_policy("whittle", fusion_gym.make_task(ENV, coefficient=1.2, horizon=100))
-    with pytest.raises(ConfigurationError, match="only remote estimation"):
+    with pytest.raises(ConfigurationError, match="it must be remote estimation"):
         make_policy("whittle", fusion_gym.make_task("fusion_gym/TobitOscillator-v1"))

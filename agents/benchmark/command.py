@@ -45,33 +45,32 @@ class Benchmark(Long):
     program = "python -m agents.benchmark"
 
     settings: tuple[str, ...] = ()
-    """Settings by name; none stands for all."""
+    """Settings by name; all by default."""
     quick: bool = False
-    """Three settings, one seed and less of everything, in minutes."""
+    """Run a small benchmark of three settings and one seed, in minutes."""
     policy: str | None = None
-    """A policy to compare with the searched rule, in the place of all else."""
+    """Only compare this policy with the searched rule."""
     class_name: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
     """Class of the policy."""
     second_search: bool = False
-    """Search three classes again with four times the generations, and compare, in the place of all
-    else."""
+    """Only search three classes again, with four times the generations, and compare."""
     results: Annotated[Path | None, OutputFolder()] = None
     """Folder for tables, figures and README.md: results, or runs/benchmark/results with --quick."""
     work: Annotated[Path, OutputFolder()] = Path("runs/benchmark")
     """Folder for finished pieces of work and agents."""
     workers: Annotated[int, Whole(1, 512)] = 2
-    """Processes side by side."""
+    """Number of parallel processes."""
     backend: BackendName = "loky"
     """Processes of this machine, or a dask cluster."""
     address: str | None = None
-    """Address of dask's scheduler; none begins a cluster of this machine."""
+    """Address of dask's scheduler; by default, a new cluster on this machine."""
 
     def run(self) -> None:
         """Run unfinished work, and write the results."""
         if self.second_search and self.policy is not None:
             raise refusal("second_search", True, "given without --policy")
         if (self.policy is None) != (self.class_name is None):
-            raise refusal("class", self.class_name, "given with --policy, and only then")
+            raise refusal("class", self.class_name, "given if and only if --policy is given")
         suite = load_suite(self.quick, self.settings)
         if self.policy is not None and self.class_name is not None:
             check_policy(suite, self.policy, self.class_name)

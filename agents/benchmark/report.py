@@ -65,12 +65,12 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
     headline = headline_text(titles, means)
     page = [
         "# Benchmark",
-        f"Made by `make benchmark` in version {__version__}: {suite.episodes:,} test episodes, "
-        f"{suite.training_seeds} training seeds. [The page](../docs/benchmark.md) says how.",
+        f"Results of `make benchmark` in version {__version__}: {suite.episodes:,} test episodes, "
+        f"{suite.training_seeds} training seeds. [Method](../docs/benchmark.md).",
         headline,
         "\n".join(f"- {text}" for text in sentences(means, points)),
         "## Classes",
-        "Mean over five prices of the cost over that of the searched rule; negative: cheaper.",
+        "Mean over five prices of the cost over the searched rule's cost; negative: cheaper.",
         class_table(titles, means, choices),
         "## Searched rules",
         table(
@@ -78,8 +78,9 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
             ((titles[row.setting], TITLES[row.name], f"`{row.rule}`") for row in choices),
         ),
         "## Wrong models",
-        "The scheduler's searched rule and the agent that validation chooses, at the three middle "
-        "prices: the rule's cost over that as assumed, and the agent's over the rule's.",
+        "The scheduler's searched rule and the best agent in validation, at the three middle "
+        "prices: the rule's cost over its cost with a true model, and the agent's cost over the "
+        "rule's.",
         table(
             ("setting", "case", "rule", "agent"),
             ((titles[r.setting], r.case, f"{r.rule:+.0%}", relative_text(r)) for r in cases),

@@ -48,7 +48,7 @@ TRIGGER = "adaptive_innovation"
 PRINTED = (0.6067, 0.485, 0.7067)  # Section 6, one run
 RULE = AdaptiveInnovation()
 _A, _B, _C = (float(RULE.column(name, 1)[0, 0]) for name in ("threshold", "offset", "sensitivity"))
-OURS, PRINTED_SIGN = "the trigger as we read it", "the sign in (10) as printed, -b + c |ε|"
+OURS, PRINTED_SIGN = "our reading of the trigger", "the sign in (10) as printed, -b + c |ε|"
 FIXED, TIMED = "c = 0", "a = 0"
 AT_BOUND, OTHERS, ALWAYS = "at the bounds", "requests of another episode", "always"
 
@@ -98,7 +98,7 @@ def _readings() -> dict[str, Lane]:
     return {
         OURS: Lane(),
         PRINTED_SIGN: Lane(rule=_Reading(_printed)),
-        "the threshold after this very step's innovation, l(k) = k": Lane(
+        "the threshold after the innovation of the same step, l(k) = k": Lane(
             rule=_Reading(lambda last, now: _ours(now, now))
         ),
         "|ε|² instead of |ε| in the exponent": Lane(

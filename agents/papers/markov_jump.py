@@ -265,7 +265,7 @@ def _summarise_theorems(data: Data) -> Data:
     moment = (data["moment"], data["moment_claimed"])
     ratios = {f"node {i + 1}": pair for i, pair in enumerate(local)}
     ratios |= {f"fused, m = {m:g}": pair for m, pair in zip(data["m"], fused, strict=True)}
-    ratios |= {"the state itself": moment}
+    ratios |= {"the state": moment}
     rows = {name: [sample / claim] for name, (sample, claim) in ratios.items()}
     return {
         "tables": {"covariances": grid(("ratio",), rows)},

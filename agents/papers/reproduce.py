@@ -62,13 +62,13 @@ class Reproduce(Command):
     seed: Seed = 0
     """Seed of the first episode."""
     resume: bool = False
-    """Keep simulations that are finished."""
+    """Reuse finished simulations."""
     output: Annotated[Path | None, OutputFolder()] = None
     """Folder for pages, figures and numbers: docs/reproduction, or runs/figures for a figure."""
     work: Annotated[Path, OutputFolder()] = Path("runs/reproduction")
     """Folder for simulations."""
     workers: Annotated[int, Whole(1, 512)] = 2
-    """Processes side by side."""
+    """Number of parallel processes."""
 
     def run(self) -> None:
         """Simulate missing pieces, then write every page, or the figure."""
@@ -83,8 +83,8 @@ class Reproduce(Command):
             self._reproduce_figure(papers[0], self.figure, changes)
         elif changes:
             raise ConfigurationError(
-                f"set = {next(iter(changes))!r} is not allowed without --figure: the pages' claims "
-                "are about the papers' own parameters"
+                f"set = {next(iter(changes))!r} is not allowed without --figure: the claims of "
+                "the pages need the papers' parameters"
             )
         else:
             self._reproduce_pages(papers, self.output or Path("docs/reproduction"))
@@ -133,7 +133,7 @@ class Reproduce(Command):
         """Return the message of an interruption, with the command that continues."""
         words = [word for word in sys.argv[1:] if word != "--resume"]
         command = f"{self.program} {shlex.join([*words, '--resume'])}"
-        return f"interrupted; go on with: {command}"
+        return f"interrupted; continue with: {command}"
 
 
 def reproduce_figure(

@@ -204,7 +204,7 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
 
 def _summarise_bucket_theorems(data: Data) -> Data:
     means = {
-        "share of gains beside (37) with a larger bound": [data["gain_larger"]],
+        "share of gains near (37) with a larger bound": [data["gain_larger"]],
         "(42) holds, share of deliveries": [data["holds_delivered"]],
         "(42) holds, share of steps without": [data["holds_silent"]],
         "growth a step of the trace if nothing is sent": [data["growth"]],

@@ -32,13 +32,13 @@ class Zoo(Long):
     program = "python -m agents.zoo"
 
     settings: tuple[str, ...] = ()
-    """Settings by name; none stands for all."""
+    """Settings by name; all by default."""
     work: Annotated[Path, OutputFolder()] = Path("runs/benchmark")
     """Folder of the benchmark's finished pieces and agents."""
     zoo: Annotated[Path, OutputFolder()] = Path(zoo.__file__).parent
     """Folder of the model zoo."""
     workers: Annotated[int, Whole(1, 512)] = 2
-    """Processes side by side."""
+    """Number of parallel processes."""
 
     def run(self) -> None:
         """Write the agents, and remove the others."""

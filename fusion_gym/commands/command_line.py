@@ -89,8 +89,8 @@ class Long(Command):
     def interrupted(self) -> str:
         """Return the command line that resumes the work, if a part is saved."""
         if not self.keeps:
-            return "interrupted: nothing is kept"
-        return f"interrupted; go on with: {self.again()}"
+            return "interrupted: nothing is saved"
+        return f"interrupted; continue with: {self.again()}"
 
     def again(self) -> str:
         """Return the words of the command line, with ``--resume`` where it exists."""

@@ -86,7 +86,7 @@ class Compare(Long):
             return {self.policy: float(task.reward.price.draw(np.array([0.5]))[0])}
         span = task.reward.price.span
         if span is None:
-            reason = "left out where the config has no price_range, as here"
+            reason = "left out, because the config has no price_range"
             raise refusal("prices", self.prices, reason)
         name, _, text = self.policy.partition(":")
         if name not in policy_names() or "price" not in policy_parameters(name):

@@ -86,9 +86,9 @@ class Evaluate(EnvironmentOptions, Long):
     def interrupted(self) -> str:
         """Return how to resume; paired differences need a new evaluation."""
         if self.json is None:
-            return "interrupted: nothing is kept (--json FILE keeps finished policies)"
+            return "interrupted: nothing is saved (--json FILE saves finished policies)"
         if self.reference is not None:
-            return f"interrupted: finished policies are in {self.json}; --reference begins anew"
+            return f"interrupted: finished policies are in {self.json}; --reference begins again"
         return super().interrupted()
 
 
@@ -190,7 +190,7 @@ def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
         if earlier.get(key) != plain[key]:
             raise ConfigurationError(
                 f"json {str(path)!r} holds another evaluation: its {key} is {earlier.get(key)!r}, "
-                f"asked for is {plain[key]!r}"
+                f"requested is {plain[key]!r}"
             )
     checked(Evaluation, earlier, f"json = {str(path)!r}")
     return earlier

@@ -70,8 +70,9 @@ def export(command: Export) -> list[str]:
         f"{command.model} is in {command.onnx}: {model.size:,} bytes",
         f"from {text}",
         f"to {answers}",
-        f"as the agent on {result.observations:,} observations of {result.episodes:,} episodes of "
-        f"{env_id}: all decisions agree, numbers differ by {result.difference:.2g} at most",
+        f"against the agent on {result.observations:,} observations of {result.episodes:,} "
+        f"episodes of {env_id}: all decisions agree, numbers differ by at most "
+        f"{result.difference:.2g}",
         f"one decision on one thread here: {1e6 * model.latency.median:.1f} µs in the median, 99 % "
         f"below {1e6 * model.latency.most:.1f} µs",
     ]
@@ -98,8 +99,8 @@ def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, 
         config_file = Path(name).parent / "config.yaml"
         if not config_file.is_file():
             raise ConfigurationError(
-                f"env = None is not allowed with model = {command.model!r}, beside which lies no "
-                "config.yaml of its training: give --env ID or --config FILE"
+                f"env = None is not allowed with model = {command.model!r}, whose folder has no "
+                "config.yaml: give --env ID or --config FILE"
             )
         config = str(config_file)
     env_id, options, _ = environment_of(command.env, config, command.options)

@@ -102,7 +102,7 @@ def _refuse_input(values: Any, option: str, path: Path) -> None:
         other = getattr(values, name)
         named = isinstance(other, str | Path) and os.path.exists(other) and os.path.exists(path)
         if named and path.samefile(other):
-            raise refusal(option, str(path), f"another file than that of {name}")
+            raise refusal(option, str(path), f"another file than {name}")
 
 
 def writable_folder(option: str, folder: Path) -> None:

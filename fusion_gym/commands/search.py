@@ -97,7 +97,7 @@ class Search(EnvironmentOptions, Long):
 
             def progress(generation: Generation) -> None:
                 keep(generation)
-                bar.say(f"best {min(generation.objectives) - 1.0:+.1%} of a single threshold")
+                bar.say(f"best {min(generation.objectives) - 1.0:+.1%} over a single threshold")
                 bar.update()
 
             return search_rule(search, tuple(generations), progress)
@@ -108,7 +108,8 @@ class Search(EnvironmentOptions, Long):
         if not self.resume:
             if path.exists() or (self.output / _RESULT).exists():
                 raise ConfigurationError(
-                    f"{place} holds a search already: go on with --resume, or give another --output"
+                    f"{place} already holds a search: continue with --resume, or give another "
+                    "--output"
                 )
             return []
         if not path.exists():

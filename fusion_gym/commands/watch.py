@@ -54,7 +54,7 @@ class Watch(EnvironmentOptions, Long):
         names = [self.policy] if self.against is None else [self.policy, self.against]
         if len(set(names)) < len(names):
             raise ConfigurationError(
-                f"against = {self.against!r} is not allowed: it is the policy itself"
+                f"against = {self.against!r} is not allowed: it must differ from policy"
             )
         policies = {name: make_policy(name, task) for name in names}
         frames = watch(task, policies, self.seed, self.steps)

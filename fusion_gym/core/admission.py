@@ -37,9 +37,9 @@ def admit(system: System[Any], horizon: int) -> Array:
         return open_loop
     if accuracy <= _WRONG:
         warnings.warn(
-            f"horizon = {horizon} with this plant and these sensors: in the worst case float64 "
-            f"holds means only to about {accuracy:.0e} of a deviation, and variances to about "
-            f"{accuracy:.0e} of their size",
+            f"horizon = {horizon} with this plant and these sensors: rounding errors may reach "
+            f"{accuracy:.0e} of a deviation in means, and {accuracy:.0e} of their size in "
+            "variances",
             stacklevel=2,
         )
         return open_loop
@@ -47,10 +47,10 @@ def admit(system: System[Any], horizon: int) -> Array:
     signal, variance = system.rounding(horizon)
     signals, variances = (_WRONG / _OF_SIGNAL / _PRECISION) ** 2, _WRONG / _OF_LOSS / _PRECISION
     why = (
-        f"float64 holds a mean squared error without transmissions up to {LARGEST_ERROR:g} (here "
-        f"{largest:.3g}), measurements with a mean square up to {signals:.0e} times their noise's "
-        f"variance (here {signal:.3g}), and variances of which a packet leaves one part in "
-        f"{variances:.0e} (here in {variance:.3g})"
+        f"float64 allows mean squared errors up to {LARGEST_ERROR:g} without transmissions (here "
+        f"{largest:.3g}), mean squares of measurements up to {signals:.0e} noise variances (here "
+        f"{signal:.3g}), and reductions of a variance to one part in {variances:.0e} by a packet "
+        f"(here in {variance:.3g})"
     )
     # The loss of accuracy grows with the horizon.
     longest = bisect_left(
@@ -59,8 +59,8 @@ def admit(system: System[Any], horizon: int) -> Array:
     if not longest:
         raise ConfigurationError(f"these numbers together are not allowed: {why}")
     raise ConfigurationError(
-        f"horizon = {horizon} is not allowed with this plant and these sensors: it must be at most "
-        f"{longest}, for {why}"
+        f"horizon = {horizon} is not allowed with this plant and these sensors: it must be at "
+        f"most {longest}, because {why}"
     )
 
 

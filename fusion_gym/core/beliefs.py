@@ -300,8 +300,8 @@ class OwnBeliefs(Beliefs):
 def _require_single_step(steps: int) -> None:
     if steps != 1:
         raise ValueError(
-            f"steps = {steps} is not allowed here: it must be 1, for a sensor by itself cannot "
-            "carry the centre's estimate on"
+            f"steps = {steps} is not allowed here: it must be 1, because a local sensor cannot "
+            "predict the centre's estimate over several steps"
         )
 
 

@@ -33,8 +33,8 @@ def communication(scenario: Scenario) -> Communication:
         memory_system = scenario.system
     if has_memory and options.information == "centre":
         raise ConfigurationError(
-            "memory = True is not allowed with information='centre': it must be False, for the "
-            "centre has nothing to remember but what was sent"
+            "memory = True is not allowed with information='centre': it must be False, because "
+            "the centre stores only deliveries"
         )
     if options.memory_filter is not None and not has_memory:
         raise validation.refusal("memory_filter", options.memory_filter, "None unless memory=True")
@@ -45,7 +45,7 @@ def communication(scenario: Scenario) -> Communication:
         )
     if options.memory_filter is not None and scenario.memory_system is None:
         raise validation.refusal(
-            "memory_filter", options.memory_filter, "None here, for this system has one filter"
+            "memory_filter", options.memory_filter, "None here, because this system has one filter"
         )
     if options.packet == "estimate":
         _check_estimates(scenario, has_memory)
@@ -55,11 +55,11 @@ def communication(scenario: Scenario) -> Communication:
 def _check_estimates(scenario: Scenario, has_memory: bool) -> None:
     reason = scenario.no_estimates
     if not has_memory:
-        reason = "it holds what the scheduler remembers, which takes memory=True"
+        reason = "an estimate needs memory=True"
     elif scenario.system.offers("arriving") or not scenario.system.offers("adopt"):
-        reason = reason or "this system's centre cannot go on from an estimate that is sent to it"
+        reason = reason or "this system's centre cannot continue from a delivered estimate"
     if reason is not None:
-        raise validation.refusal("packet", "estimate", f"'measurement', for {reason}", "here")
+        raise validation.refusal("packet", "estimate", f"'measurement', because {reason}", "here")
 
 
 def _broadcast(scenario: Scenario) -> str:
@@ -68,8 +68,8 @@ def _broadcast(scenario: Scenario) -> str:
         return "estimate" if scenario.feedback else "none"
     if value == "none" and scenario.feedback:
         raise ConfigurationError(
-            "broadcast = 'none' is not allowed here: it must be 'estimate' or 'packets', for the "
-            "nodes get the centre's estimate back"
+            "broadcast = 'none' is not allowed here: it must be 'estimate' or 'packets', because "
+            "the nodes receive the centre's estimate"
         )
     return value
 

@@ -57,8 +57,7 @@ class Memory:
             raise refusal(
                 "packet",
                 task.packet,
-                "'measurement' where sensors decide by themselves, for the estimate is the "
-                "scheduler's, of all sensors",
+                "'measurement' with local sensors, because the estimate belongs to the scheduler",
             )
         distant = task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
         self._needs_single = own and distant

@@ -18,7 +18,7 @@ DEPARTURES = {
     "true_process_noise": "the plant has no process noise",
     "true_measurement_noise": "the sensors measure without noise",
     "true_threshold_shift": "no sensor is censored",
-    "true_transition": "the plant stays where noise and input put it",
+    "true_transition": "only noise and input move the plant",
 }
 _SHIFT = "true_threshold_shift"
 _MODEL = (1.0, 1.0, 0.0, 1.0)  # no departure
@@ -61,7 +61,7 @@ class Nature:
             if name in absent:
                 model = _MODEL[list(DEPARTURES).index(name)]
                 raise refusal(
-                    name, getattr(selection, name), f"{model:g} here, for {DEPARTURES[name]}"
+                    name, getattr(selection, name), f"{model:g} here, because {DEPARTURES[name]}"
                 )
         return nature
 
@@ -98,17 +98,17 @@ class Nature:
         largest = max((radius(end) for end in ends), default=0.0)
         if 2.0 * horizon * np.log10(max(largest, 1.0)) > np.log10(_LARGEST_GROWTH):
             raise ConfigurationError(
-                f"true_transition = {self._range('true_transition')} is not allowed with horizon = "
-                f"{horizon}: the true plant's spectral radius would be {largest:.4g}, and its "
-                f"square may grow by {_LARGEST_GROWTH:g} at most in an episode"
+                f"true_transition = {self._range('true_transition')} is not allowed with horizon "
+                f"= {horizon}: the true plant has the spectral radius {largest:.4g}, and its "
+                f"second moment may grow at most {_LARGEST_GROWTH:g} times in an episode"
             )
 
-    def refuse(self, where: str, why: str = "that holds where the truth is as assumed") -> None:
+    def refuse(self, where: str, why: str = "it needs the assumed truth") -> None:
         """Raise an error if the truth departs from the model, with place and reason."""
         for name in self.departing:
             raise ConfigurationError(
                 f"{name} = {self._range(name)} is not allowed {where}: it must be "
-                f"{_MODEL[list(DEPARTURES).index(name)]:g}, for {why}"
+                f"{_MODEL[list(DEPARTURES).index(name)]:g}, because {why}"
             )
 
     def _range(self, name: str) -> str:
@@ -126,7 +126,7 @@ def _span(name: str, value: Any) -> tuple[float, float]:
     least, most = (-np.inf, np.inf) if name == _SHIFT else _FACTORS
     if not (least <= low and high <= most and (np.ndim(value) == 0 or low < high)):
         limits = "" if name == _SHIFT else f" from {least:g} to {most:g}"
-        raise refusal(name, value, f"a number{limits}, or a pair of such (low, high), low < high")
+        raise refusal(name, value, f"a number{limits}, or such a pair (low, high), low < high")
     return low, high
 
 

@@ -147,7 +147,7 @@ class CommonOptions:
     def __post_init__(self) -> None:
         if str(self.information) == "local":
             calls = "fusion_gym.parallel_env(id) and make_sb3_vec_env(id, n, local=True)"
-            allowed = f"'sensors' or 'centre'; decentralised sensors are {calls}"
+            allowed = f"'sensors' or 'centre'; for decentralised sensors use {calls}"
             raise refusal("information", "local", allowed)
         declaration.check(self)
 

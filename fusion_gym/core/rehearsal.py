@@ -21,6 +21,6 @@ def rehearse(task: Task) -> None:
         batch.observe()
     except DivergenceError as error:
         raise ConfigurationError(
-            f"these numbers together are not allowed: {error}, for they lie too far apart or make "
-            "a covariance singular"
+            f"these numbers together are not allowed: {error}; they lie too far apart or make a "
+            "covariance singular"
         ) from None

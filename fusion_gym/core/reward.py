@@ -33,8 +33,8 @@ def equal_weights(open_loop: Array) -> Array:
 def _at_rest(open_loop: Array) -> ConfigurationError:
     """Return the error of a plant with a state that is known without transmissions."""
     return ConfigurationError(
-        f"a squared error of {validation.display(open_loop)} without transmissions is not allowed: "
-        "every state must be moved by noise before the horizon, or be uncertain at the start"
+        f"a squared error of {validation.display(open_loop)} without transmissions is not "
+        "allowed: every state must have noise before the horizon, or an uncertain start"
     )
 
 
@@ -45,7 +45,7 @@ def _cost(error: str | Cost, states: int) -> str | Cost:
         listed = ", ".join(repr(kind) for kind in ERROR_KINDS)
         near = validation.nearest(own, ERROR_KINDS) if isinstance(own, str) else None
         hint = f" (did you mean {near!r}?)" if near else ""
-        allowed = f"one of {listed}, a function, or 'module:name' of one{hint}"
+        allowed = f"one of {listed}, a function, or its 'module:name'{hint}"
         raise validation.refusal("error", own, allowed)
     if not isinstance(own, str):
         name = error if isinstance(error, str) else name_of(own)
@@ -68,9 +68,9 @@ def _own_cost(function: Cost, name: str, error: Array, covariance: Array) -> Arr
     values = np.asarray(function(error, covariance), dtype=np.float64)
     if values.shape != error.shape[1:] or not np.all(values >= 0.0):
         raise ConfigurationError(
-            f"error = {name!r} is not allowed: of errors {error.shape} it must "
-            f"return numbers >= 0 of shape {error.shape[1:]}, and returned "
-            f"{validation.display(values)} of shape {values.shape}"
+            f"error = {name!r} is not allowed: for errors {error.shape} it must return numbers >= "
+            f"0 of shape {error.shape[1:]}, but it returned {validation.display(values)} of shape "
+            f"{values.shape}"
         )
     return values
 

@@ -44,7 +44,7 @@ def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array 
         else:
             raise ConfigurationError(
                 "reward_scale = 'auto' is not allowed here: packets at an even pace leave mean "
-                f"squared errors of {display(error)}; they must be finite, and one > 0"
+                f"squared errors of {display(error)}; they must be finite, and one must be > 0"
             )
         options = replace(options, reward_scale=factor)
     if _is_auto(options.price_range):

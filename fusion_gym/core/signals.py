@@ -46,7 +46,7 @@ def memory_signals(owner: Owner, beliefs: Callable[[], Beliefs]) -> Mapping[str,
 def missing_signals(owner: Owner) -> Mapping[str, str]:
     """Return the names of another owner's signals, and the reason for their absence."""
     why = (
-        "is not there, for this batch does not keep what it needs: a policy that looks at what is "
-        "believed declares whose beliefs as an attribute, memory_owner = 'scheduler' or 'own'"
+        "is absent, because this batch does not compute it: a policy that reads beliefs must "
+        "declare the attribute memory_owner = 'scheduler' or 'own'"
     )
     return {name: f"signal {name!r} {why}" for name in (_EVERY if owner == "own" else _OWN)}

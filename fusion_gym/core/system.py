@@ -279,7 +279,7 @@ class Signals(Mapping[str, SignalArray]):
         self._values = dict(values)
         self._withheld = dict(missing or {}) | {
             name: f"signal {name!r} is known to the sensors only; information='centre' withholds "
-            "it (use information='sensors', or a policy that looks at the centre's signals)"
+            "it (use information='sensors', or a policy that reads the centre's signals)"
             for name in hidden
         }
 

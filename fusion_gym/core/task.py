@@ -96,13 +96,13 @@ class Task:
         if self.action == "discrete" and self.access != "single" and self.sensors > _MOST_DISCRETE:
             raise validation.ConfigurationError(
                 f"action = 'discrete' is not allowed with {self.sensors} sensors: it numbers all "
-                f"sets of requests, of at most {_MOST_DISCRETE} sensors"
+                f"sets of requests, so it allows at most {_MOST_DISCRETE} sensors"
             )
         states = len(self.system.state_names)
         if self.reward.state_weights.shape != (states, 1):
             raise validation.ConfigurationError(
                 f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
-                f"system has {states} states, so it must be ({states}, 1)"
+                f"system has {states} states, so its shape must be ({states}, 1)"
             )
 
     @classmethod
@@ -219,22 +219,22 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
     whole = float(bucket.cost.sum())
     if not bucket.unlimited and bucket.capacity < whole:
         warnings.warn(
-            f"token_capacity = {bucket.capacity:g} is below {whole:g}, the cost of a packet of "
-            f"each of the {sensors} sensors: they never transmit together",
+            f"token_capacity = {bucket.capacity:g} is below {whole:g}, the cost of one packet of "
+            f"each of the {sensors} sensors: they cannot all transmit in one step",
             stacklevel=2,
         )
     if options.access == "round_robin" and bucket.resonates:
         warnings.warn(
             f"token_rate = {bucket.rate:g} and token_cost = {bucket.cost.max():g} with "
-            f"access='round_robin' grant some of the {sensors} sensors more often than others "
-            "where all request; access='any' with sharing='turns' does not",
+            f"access='round_robin' favour some of the {sensors} sensors if all request; "
+            "access='any' with sharing='turns' does not",
             stacklevel=2,
         )
     if options.access in ("round_robin", "random") and bucket.favours_cheaper:
         warnings.warn(
             f"token_rate = {bucket.rate:g} is below token_cost, up to {bucket.cost.max():g}, with "
-            f"access={options.access!r}: where the tokens do not pay, the turn is lost, so that "
-            "dearer sensors are granted less often; access='any' with sharing='turns' is even",
+            f"access={options.access!r}: a sensor without enough tokens loses its turn, so dearer "
+            "sensors get fewer grants; access='any' with sharing='turns' is even",
             stacklevel=2,
         )
     return bucket

@@ -32,17 +32,17 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     specs = envs.get_attr("spec")
     spec = specs[0]
     if spec is None:
-        raise ConfigurationError("environments in one batch must be made by gym.make")
+        raise ConfigurationError("gym.make must create the environments of one batch")
     base, _ = base_of(spec.id)  # the specification has the options too
     if any(_spec_key(other) != _spec_key(spec) for other in specs):
         raise ConfigurationError(
             f"different environments {display([_spec_key(other) for other in specs])} are not "
-            "allowed in one batch: all must be made alike"
+            "allowed in one batch: all must be the same"
         )
     wrappers = [w.name for w in spec.additional_wrappers if w.name != Monitor.__name__]
     if wrappers:
         raise ConfigurationError(
-            f"wrappers {display(wrappers)} are not allowed in one batch, which would lack them"
+            f"wrappers {display(wrappers)} are not allowed in one batch: it cannot apply them"
         )
     arguments = dict(spec.kwargs)
     if arguments.pop("render_mode", None) == "human":

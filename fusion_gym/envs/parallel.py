@@ -107,7 +107,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         if not isinstance(actions, Mapping) or set(actions) != set(self.agents):
             raise ValueError(
                 f"actions {display(actions)} are not allowed: they must be a dictionary with one "
-                f"of each of {self.agents}"
+                f"action of each of {self.agents}"
             )
         selection = [actions[agent] for agent in self.agents]
         outcome = self.batch.step(self.view.requests(selection, None))

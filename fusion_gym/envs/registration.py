@@ -217,12 +217,12 @@ def make_task(env: str | CommonOptions, /, **options: Any) -> Task:
     if limit is not None:
         limit = validation.integer("max_episode_steps", limit, at_least=1)
     if isinstance(env, CommonOptions):
-        validation.keys("option beside an options object", options, [])
+        validation.keys("option together with an options object", options, [])
         env_id = next((name for name in ENVIRONMENTS if options_of(name) is type(env)), None)
         if env_id is None:
             raise ConfigurationError(
-                f"options of type {type(env).__name__} are not allowed: they belong to none of the "
-                "registered environments"
+                f"options of type {type(env).__name__} are not allowed: they belong to no "
+                "registered environment"
             )
         return _checked(build_of(env_id), env, limit)
     kind, options = options_of(env), open_options(env, options)

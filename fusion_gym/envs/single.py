@@ -165,7 +165,7 @@ def _steps_singly() -> bool:
 def _warn_of_single_steps() -> None:
     warnings.warn(
         "Stable-Baselines3 steps this environment one episode at a time; "
-        "fusion_gym.make_sb3_vec_env(id, 64) steps 64 in one batch, many times as fast",
+        "fusion_gym.make_sb3_vec_env(id, 64) steps 64 in one batch, many times faster",
         stacklevel=3,
     )
 

@@ -117,12 +117,12 @@ class SensorView:
         if task.packet == "estimate":
             raise ConfigurationError(
                 "packet = 'estimate' is not allowed with a local view: it must be 'measurement', "
-                "for the estimate is the scheduler's, of all sensors"
+                "because the estimate belongs to the scheduler"
             )
         if task.information != "sensors":
             raise ConfigurationError(
                 f"information = {task.information!r} is not allowed with a local view: it must be "
-                "'sensors', for a sensor sees its own measurement"
+                "'sensors', because a sensor uses its own measurement"
             )
         layout, count = ObservationLayout(task, "own"), task.sensors
         received = [
@@ -136,7 +136,7 @@ class SensorView:
         if any(kinds != names[0] for kinds in names):
             raise ConfigurationError(
                 f"observation entries {names} are not allowed in a local view: all sensors must "
-                "see the same kinds"
+                "have the same kinds of entries"
             )
         self._columns = np.array(columns)
         self.rows_per_run = count

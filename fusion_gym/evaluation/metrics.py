@@ -52,11 +52,11 @@ METRICS = {
     "bound_trace": Metric(
         "trace of the claimed covariance, per step", column="trace P", form=".4g"
     ),
-    "nees": Metric("normalised squared error, divided by the states", "1", column="NEES"),
+    "nees": Metric("normalised squared error over the rank of the covariance", "1", column="NEES"),
     "rate": Metric("transmissions per step", "lower", "sensor", "rate"),
     "requests": Metric("requests per step", axis="sensor", column="requests"),
     "tokens": Metric("tokens spent per step", "lower", column="tokens"),
-    "denied": Metric("requests refused per step", "lower", column="denied"),
+    "denied": Metric("requests denied per step", "lower", column="denied"),
     "return": Metric(
         "sum of the rewards of an episode", "higher", column="return", form=".4g", interval=True,
         samples=lambda results: results.returns,

@@ -61,8 +61,9 @@ def export_onnx(
     if not result.holds:
         path.unlink()
         raise ConfigurationError(
-            f"{result.different:,} of {result.observations:,} observations are decided otherwise "
-            f"than by the agent, and numbers differ by up to {result.difference:.3g}"
+            f"file and agent decide differently on {result.different:,} of "
+            f"{result.observations:,} observations, and numbers differ by up to "
+            f"{result.difference:.3g}"
         )
     taken = latency(graph, path)
     return Exported(path.stat().st_size, graph.inputs, graph.outputs, result, taken)

@@ -64,8 +64,8 @@ def run_policies(
     owners = {owner_of(policy) for policy in policies}
     if len(owners) != 1:
         raise ConfigurationError(
-            f"policies that look at the beliefs of {sorted(map(str, owners))} are not allowed "
-            "beside each other: there must be some, and all must look at the same owner's"
+            f"policies with the belief owners {sorted(map(str, owners))} are not allowed "
+            "together: there must be policies, and all must have the same owner"
         )
     runs = len(policies) * episodes
     for policy in policies:

@@ -233,7 +233,7 @@ def try_thresholds(
 ) -> list[ThresholdTrial]:
     """Run a rule with each of several thresholds, ``{value}`` in the template, in one batch."""
     if "{value}" not in template:
-        raise validation.refusal("template", template, "a policy with {value} for its threshold")
+        raise validation.refusal("template", template, "a policy with {value} as its threshold")
     texts = [template.replace("{value}", f"{value:.5g}") for value in values]
     rules = [make_policy(text, task) for text in texts]
     size, briefs = max(_RUNS // episodes, 1), list[EpisodeMeans]()
@@ -272,7 +272,7 @@ def search_rule(
 
 def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> Iterator[Generation]:
     """Yield the generations of a search after the earlier ones."""
-    require("a search of a rule", "agents", "cmaes")
+    require("the search of a rule", "agents", "cmaes")
     from cmaes import CMA
 
     ranges = np.array([_RANGES[name] for name in search.coordinates])

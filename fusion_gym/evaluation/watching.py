@@ -76,7 +76,7 @@ def watch(
     if steps is not None:
         validation.integer("steps", steps, at_least=1, at_most=task.horizon)
     if not policies:
-        raise ConfigurationError("policies = {} is not allowed: name one at least")
+        raise ConfigurationError("policies = {} is not allowed: it must name at least one")
     watched = []
     for name, policy in policies.items():
         batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))

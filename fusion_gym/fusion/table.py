@@ -31,12 +31,12 @@ Assumption = Literal[
 # bound, but they are offered, as in their papers.
 REASONS: dict[Assumption, str] = {
     "independence": (
-        "the errors of these estimates are correlated ({common}), and adding their information "
-        "would count what they share several times"
+        "the errors of these estimates are correlated ({common}), but this rule assumes "
+        "independent errors"
     ),
     "information shares": (
-        "nothing is fed back to the nodes that could share information out among them, and the "
-        "errors of these estimates are correlated ({common})"
+        "the centre feeds no shares of information back to the nodes, and the errors of these "
+        "estimates are correlated ({common})"
     ),
     "joint covariance": "the joint covariance of the errors is not known ({common})",
     "tracked weights": "'ci' has the exact weights here",
@@ -142,22 +142,23 @@ def choose_rule(
     known = structure.offered
     if isinstance(name, str) and name in RULES and name not in known:
         raise ConfigurationError(
-            f"fusion = {name!r} is not allowed: it must be one of "
-            f"{', '.join(map(repr, known))}, for {structure.refusal(RULES[name])}"
+            f"fusion = {name!r} is not allowed: it must be one of {', '.join(map(repr, known))}, "
+            f"because {structure.refusal(RULES[name])}"
         )
     rule = RULES[validation.choice("fusion", name, known)]
     if rule.pair and sensors + structure.prediction != 2:
         prediction = " (the centre's prediction is one of them)" if structure.prediction else ""
         raise ConfigurationError(
             f"fusion = {name!r} is not allowed with {sensors} sensors: it joins two "
-            f"estimates{prediction}; it must be 'sici' (two at a time) for more"
+            f"estimates{prediction}; for more it must be 'sici', which joins two at a time"
         )
     if rule.cubic and sensors > MOST_TOGETHER:
         others = [key for key in known if not RULES[key].cubic and not RULES[key].pair]
         instead = f", so it must be {' or '.join(map(repr, others))}" if others else ""
         raise ConfigurationError(
             f"fusion = {name!r} is not allowed with {sensors} sensors: it joins the estimates of "
-            f"at most {MOST_TOGETHER}, for its cost grows with the cube of their number{instead}"
+            f"at most {MOST_TOGETHER}, because its cost grows with the cube of their "
+            f"number{instead}"
         )
     if order is None:
         return rule.make()

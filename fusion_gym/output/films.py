@@ -35,7 +35,7 @@ def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:
         if goal is not unfinished:
             unfinished.write_bytes(goal.getvalue())
         elif not _complete(unfinished, count):
-            raise OSError(errno.EIO, "the film is not complete, perhaps for want of room")
+            raise OSError(errno.EIO, "the film is not complete; the disk may be full")
 
 
 def _complete(film: Path, count: int) -> bool:

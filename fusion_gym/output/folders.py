@@ -47,11 +47,11 @@ def check_inputs(arguments: Mapping[str, Any], earlier: Any, label: str) -> None
     now = _flat(json.loads(json.dumps(arguments, default=list)))
     then = _flat(earlier) if isinstance(earlier, Mapping) else {}
     if not then:
-        raise ConfigurationError(f"{label} does not say what it was made from")
+        raise ConfigurationError(f"{label} has no record of its inputs")
     for key in dict.fromkeys([*now, *then]):
         if now.get(key, _ABSENT) != then.get(key, _ABSENT):
             raise ConfigurationError(
-                f"{key} = {now.get(key, _ABSENT)!r} differs from that of {label}: "
+                f"{key} = {now.get(key, _ABSENT)!r} differs from {label}, which has "
                 f"{then.get(key, _ABSENT)!r}"
             )
 

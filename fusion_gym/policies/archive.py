@@ -41,9 +41,9 @@ def read_plain(file: Path) -> dict[str, Any]:
     try:
         data = json.loads(content)
     except (ValueError, RecursionError):
-        raise _none("its data is no JSON") from None
+        raise _none("its data is not JSON") from None
     if not isinstance(data, dict):
-        raise _none("its data is no JSON object")
+        raise _none("its data is not a JSON object")
     return data
 
 
@@ -54,7 +54,7 @@ def read_weights(file: Path) -> dict[str, torch.Tensor]:
         with zipfile.ZipFile(content) as parts:
             listed = parts.infolist()
     except _DAMAGE:
-        raise NeedsTrust("its policy.pth has not the form that torch writes") from None
+        raise NeedsTrust("its policy.pth is not in torch's format") from None
     if any(part.compress_type != zipfile.ZIP_STORED for part in listed):
         raise NeedsTrust("its weights are compressed")
     content.seek(0)
@@ -63,7 +63,7 @@ def read_weights(file: Path) -> dict[str, torch.Tensor]:
     except Exception:  # a crafted file may raise any error
         raise NeedsTrust("its policy.pth holds more than plain weights") from None
     if not isinstance(data, dict) or len(data) > _MOST or not all(map(_is_plain, data.values())):
-        raise NeedsTrust("its policy.pth is no table of float32 weights")
+        raise NeedsTrust("its policy.pth is not a table of float32 weights")
     size = 4 * sum(weight.numel() for weight in data.values())
     if size > LARGEST:
         raise NeedsTrust(f"its weights have {size} bytes, more than {LARGEST}")
@@ -80,7 +80,7 @@ def _part(file: Path, name: str) -> bytes:
             if about.file_size > LARGEST:
                 raise NeedsTrust(f"its {name} has {about.file_size} bytes, more than {LARGEST}")
             if about.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise NeedsTrust(f"its {name} is compressed in an unusual way")
+                raise NeedsTrust(f"its {name} has an unusual compression")
             with archive.open(about) as part:
                 return part.read(about.file_size)
     except KeyError:
@@ -99,4 +99,4 @@ def _is_plain(weight: Any) -> bool:
 
 
 def _none(reason: str) -> ConfigurationError:
-    return ConfigurationError(f"it is no Stable-Baselines3 model ({reason})")
+    return ConfigurationError(f"it is not a Stable-Baselines3 model ({reason})")

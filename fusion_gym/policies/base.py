@@ -108,7 +108,7 @@ class Rule:
     @property
     def knowledge(self) -> Knowledge:
         """The least knowledge class with all signals of the rule; each rule declares its own."""
-        raise TypeError(f"{type(self).__name__} does not say who knows what it looks at")
+        raise TypeError(f"{type(self).__name__} must declare knowledge")
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
@@ -130,7 +130,7 @@ class Rule:
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N) for these signals."""
-        raise TypeError(f"{type(self).__name__} does not say what it requests")
+        raise TypeError(f"{type(self).__name__} must implement __call__")
 
 
 def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:

@@ -51,14 +51,14 @@ def check_owner(task: Task, own: bool, **only_together: Any) -> None:
     if task.information != "sensors":
         raise ConfigurationError(
             f"information = {task.information!r} is not allowed with this rule: it must be "
-            "'sensors', for it weighs the new measurements"
+            "'sensors', because it reads new measurements"
         )
     if not own:
         return
     SensorView(task)  # refuses tasks without local decisions
     for name, value in only_together.items():
         if value not in (None, 0, 1):
-            raise refusal(name, value, "left out with own=True, for every sensor decides by itself")
+            raise refusal(name, value, "left out with own=True, because sensors decide locally")
 
 
 def beliefs_of(signals: Signals, own: bool) -> Beliefs:

@@ -105,7 +105,7 @@ class ModelView:
         if own is None or not task.belief_features or self.observation_names is None:
             return task
         if error is None or len(error) != len(own):
-            allowed = f"{len(own)} numbers, for the task scales beliefs by them; train it again"
+            allowed = f"{len(own)} numbers, because they scale its beliefs; train it again"
             raise validation.refusal("nominal_error", error, allowed)
         return replace(task, nominal_error=np.array(error))
 
@@ -189,12 +189,12 @@ def _inferred(data: Mapping[str, Any]) -> Blueprint:
     algorithm, settings = algorithm_of(data), _table(data, "policy_kwargs")
     module = _table(data, "policy_class").get("__module__")
     if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
-        raise NeedsTrust(f"its policy is none of those of {', '.join(POLICIES)}")
+        raise NeedsTrust(f"its policy belongs to none of {', '.join(POLICIES)}")
     if "gymnasium.spaces.box.Box" not in str(_table(data, "observation_space").get(":type:")):
-        raise NeedsTrust("it observes no vector")
+        raise NeedsTrust("its observation is not a vector")
     strange = sorted(set(settings) - _HARMLESS - {":type:", ":serialized:"})
     if strange:
-        raise NeedsTrust(f"its policy was made with {strange}")
+        raise NeedsTrust(f"its policy has other settings, {strange}")
     usual = ACTIVATIONS["relu" if algorithm == "dqn" else "tanh"]  # the policies' default
     value = settings.get("activation_fn", str(usual))
     names = [n for n, kind in ACTIVATIONS.items() if str(kind) == value]
@@ -214,7 +214,7 @@ def _entry(data: Mapping[str, Any]) -> dict[str, Any]:
 def _table(data: Mapping[str, Any], key: str) -> dict[str, Any]:
     result = data.get(key)
     if not isinstance(result, dict):
-        raise ConfigurationError(f"it is no Stable-Baselines3 model (its {key} is no table)")
+        raise ConfigurationError(f"it is not a Stable-Baselines3 model (its {key} is not a table)")
     return result
 
 

@@ -33,8 +33,8 @@ class Imagination:
         for system in (task.system, task.memory_system or task.system):
             if not system.offers("imagine"):
                 raise ConfigurationError(
-                    f"{type(system).__name__} cannot be imagined here: what is hidden in it, the "
-                    "truth and what comes, has no law by which it is drawn in each episode"
+                    f"{type(system).__name__} is not allowed here: it must offer 'imagine', which "
+                    "draws the truth and future noise from their distributions"
                 )
         self._first = task.system.imagination_channels
         self._each = task.system.noise_channels + (task.access == "random")

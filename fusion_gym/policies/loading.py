@@ -80,18 +80,16 @@ def _rebuilt(
         {name: tuple(weight.shape) for name, weight in weights.items()}
     )
     if blueprint.network not in (None, network.plain()):
-        raise ConfigurationError(
-            f"its card's network is not that of its weights, {network.plain()}"
-        )
+        raise ConfigurationError(f"its card's network differs from its weights, {network.plain()}")
     if not network.fits(blueprint.algorithm):
-        raise NeedsTrust(f"its weights are not those of {blueprint.algorithm}")
+        raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}")
     action, view = _fitted(task, observed, (network.entries,), blueprint.actions)
     model = _empty(blueprint.algorithm, view)
     model.policy = _policy(blueprint, network, view)
     try:
         model.policy.load_state_dict(weights, strict=True)
     except RuntimeError:
-        raise NeedsTrust(f"its weights are not those of {blueprint.algorithm}") from None
+        raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}") from None
     if blueprint.algorithm == "dqn":  # its random decisions need the exploration rate
         rate = data.get("exploration_rate", 0.0)
         model.exploration_rate = validation.number(  # type: ignore[attr-defined]

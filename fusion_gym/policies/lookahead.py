@@ -74,20 +74,20 @@ class Lookahead:
         if task.information != "sensors":
             raise ConfigurationError(
                 f"information = {task.information!r} is not allowed with policy 'lookahead': it "
-                "must be 'sensors', for it weighs the new measurements"
+                "must be 'sensors', because it reads new measurements"
             )
         self._task = task
         self.greedy = task.sensors > _MOST_TOGETHER and task.access != "single"
         if self.greedy and task.sensors > _MOST_GREEDY:
             raise ConfigurationError(
                 f"sensors = {task.sensors} is not allowed with policy 'lookahead': it must be at "
-                f"most {_MOST_GREEDY}, for a step may cost the cube of their number; "
-                "'value_of_information' weighs each sensor alone"
+                f"most {_MOST_GREEDY}, because a step may cost the cube of their number; "
+                "'value_of_information' evaluates single sensors"
             )
         if self.greedy:
             warnings.warn(
                 f"policy 'lookahead' adds one transmission after another for {task.sensors} "
-                f"sensors: all sets are weighed of at most {_MOST_TOGETHER}",
+                f"sensors: it compares all sets of at most {_MOST_TOGETHER} sensors",
                 stacklevel=2,
             )
             return

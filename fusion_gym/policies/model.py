@@ -72,8 +72,8 @@ class ModelPolicy:
         if price is not None:
             if span is None:
                 raise ConfigurationError(
-                    f"price = {price!r} is not allowed: the model was trained without a "
-                    "price_range, for one price alone"
+                    f"price = {price!r} is not allowed: the model has no price_range, only a "
+                    "single price"
                 )
             price_setting = Price.create(price, span)
             self.price = float(price_setting.encode(price_setting.draw(np.zeros(1)))[0])

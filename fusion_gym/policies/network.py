@@ -45,7 +45,7 @@ class NetworkShape:
             entries = (chains["pi"] or [_pair(shapes, "action_net.weight")])[0][1]
         into = memory.size if memory else entries
         if any(chain and chain[0][1] != into for chain in chains.values()):
-            raise NeedsTrust("its weights do not fit each other")
+            raise NeedsTrust("the shapes of its weights disagree")
         hidden_sizes = {head: tuple(o for o, _ in chain) for head, chain in chains.items()}
         return cls(hidden_sizes, entries, memory)
 
@@ -85,7 +85,7 @@ def _memory(shapes: Shapes) -> tuple[_Memory, int]:
     for layer in range(layers):
         required = {"ih": (4 * size, size if layer else entries), "hh": (4 * size, size)}
         if any(_pair(shapes, f"lstm_actor.weight_{k}_l{layer}") != w for k, w in required.items()):
-            raise NeedsTrust("its weights do not fit each other")
+            raise NeedsTrust("the shapes of its weights disagree")
     critic: Literal["own", "shared", "none"] = "shared"
     if "lstm_critic.weight_ih_l0" in shapes:
         critic = "own"
@@ -100,12 +100,12 @@ def _chain(shapes: Shapes, prefix: str) -> list[tuple[int, int]]:
     while f"{prefix}.{2 * len(result)}.weight" in shapes:
         result.append(_pair(shapes, f"{prefix}.{2 * len(result)}.weight"))
         if len(result) > 1 and result[-1][1] != result[-2][0]:
-            raise NeedsTrust("its weights do not fit each other")
+            raise NeedsTrust("the shapes of its weights disagree")
     return result
 
 
 def _pair(shapes: Shapes, name: str) -> tuple[int, int]:
     shape = shapes.get(name, ())
     if len(shape) != 2 or not all(shape):
-        raise NeedsTrust(f"its weights {name!r} are missing, or no matrix")
+        raise NeedsTrust(f"its weights {name!r} are missing or not a matrix")
     return shape[0], shape[1]

@@ -21,14 +21,14 @@ from fusion_gym.version import __version__
 
 FORMAT = "1"
 _MEANINGS = {
-    "observation": "rows as the environment shows them, clipped to their bounds inside",
-    "grantable": "whom the network would serve: no request is made of others",
+    "observation": "rows of the environment's observation, which the graph clips to their bounds",
+    "grantable": "sensors that the network would grant; the others do not request",
     "hidden": "memory; zero at the start of an episode, then hidden_next",
     "cell": "memory; zero at the start of an episode, then cell_next",
     "request": "the decision: 1 requests to transmit",
-    "probability": "of a request, as the agent decides while it learns",
-    "logits": "of the distribution that the agent decides by",
-    "values": "what each choice is worth, as learned",
+    "probability": "probability of a request if actions are drawn, as in training",
+    "logits": "logits of the distribution of actions",
+    "values": "learned value of each action",
     "hidden_next": "memory for the next step",
     "cell_next": "memory for the next step",
 }
@@ -45,7 +45,7 @@ def onnx_card(
     visible = {name.partition("[")[0] for name in names}
     blocks = [_block(block, local) for block in layout.blocks if block.name in visible]
     if local and task.own_number:
-        number = Block("sensor", "which sensor it is", np.array, (numbered(task.sensors),))
+        number = Block("sensor", "number of the sensor", np.array, (numbered(task.sensors),))
         blocks.append(_block(number, local))
     price = task.reward.price.span
     values = {
@@ -66,7 +66,7 @@ def onnx_card(
         "model": model,
         "algorithm": algorithm_name(agent.model),
         "environment": environment,
-        "decides": "each sensor by itself" if local else "a scheduler of all sensors",
+        "decides": "each sensor locally" if local else "a scheduler of all sensors",
         "knows": MEANING[agent.knowledge],
         "observation_version": layout_version(environment, names),
     }

@@ -49,12 +49,12 @@ class DecisionGraph(torch.nn.Module):
         policy: Any = agent.model.policy
         if not agent.deterministic:
             raise ConfigurationError(
-                "deterministic = False is not allowed here: it must be True; the graph has the "
-                "probability of every request beside the request"
+                "deterministic = False is not allowed here: it must be True; the graph also "
+                "returns the probability of every request"
             )
         if not isinstance(policy, tuple(POLICIES.values())):
             raise ConfigurationError(
-                f"policy {type(policy).__name__} is not allowed here: it must be that of "
+                f"policy {type(policy).__name__} is not allowed here: it must be a policy of "
                 f"{', '.join(POLICIES)}"
             )
         self._policy: Any = agent.model.policy

@@ -13,7 +13,7 @@ from fusion_gym.solvers.task import solve_task
 
 
 class OptimalPolicy:
-    r"""Request as the solved optimum of a task does, by errors, channels and tokens.
+    r"""Request by the optimum of the task.
 
     The exact optimum of an episode depends on the remaining steps, the stationary optimum does not
     (:func:`solve_task`). ``optimum`` is the solution with its cost.

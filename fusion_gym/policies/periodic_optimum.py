@@ -102,15 +102,15 @@ class PeriodicOptimum:
         if task.access != "any":
             raise ConfigurationError(
                 f"access = {task.access!r} is not allowed with policy 'periodic_optimum': it must "
-                "be 'any', for the search grants every request"
+                "be 'any', because the search grants every request"
             )
         _cycle(task.system)
         count = math.comb(period * task.sensors, packets)
         if count > _MOST:
             raise ConfigurationError(
                 f"packets = {packets} with period = {period} and {task.sensors} sensors is not "
-                f"allowed: of {count} schedules at most {_MOST} can be compared, so period must "
-                "be smaller"
+                f"allowed: these are {count} schedules, but the search compares at most {_MOST}; "
+                "use a smaller period"
             )
         steps = task.horizon if average == "episode" else None
         self.schedule, self.trace = optimum(task.system, packets, period, cache, steps)
@@ -236,8 +236,8 @@ def _cycle(system: System[Any]) -> int:
     if not system.offers("covariance_cycle"):
         raise ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(system).__name__}: it must be a "
-            "system whose covariances do not depend on the data but on what is delivered, such as "
-            "MarkovJumpTracking-v1 with filter='local' or 'centralised', CorrelatedTracking-v1, "
-            "or UnknownInput-v1 with filter='random_walk' or 'predict'"
+            "system whose covariances depend only on deliveries, such as MarkovJumpTracking-v1 "
+            "with filter='local' or 'centralised', CorrelatedTracking-v1, or UnknownInput-v1 "
+            "with filter='random_walk' or 'predict'"
         )
     return system.covariance_cycle

@@ -107,7 +107,7 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
     if not isinstance(name, str) or not name.isidentifier():
         raise refusal("name", name, "a word of letters, digits and '_'")
     if name in _ROWS:
-        raise ConfigurationError(f"name = {name!r} is not allowed: there is a policy of that name")
+        raise ConfigurationError(f"name = {name!r} is not allowed: a policy has this name")
     choice("kind", kind, get_args(Kind))
     _parameters(name, maker)
     _ROWS[name] = PolicyRow(maker, kind)
@@ -215,8 +215,8 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
     declared = getattr(policy, "knowledge", None)
     if declared not in KNOWLEDGE:
         raise ConfigurationError(
-            f"policy {spec!r} has knowledge = {declared!r}: it must declare who knows what it "
-            f"looks at, one of {', '.join(map(repr, KNOWLEDGE))}"
+            f"policy {spec!r} has knowledge = {declared!r}: it must be one of "
+            f"{', '.join(map(repr, KNOWLEDGE))}"
         )
     return policy
 
@@ -243,7 +243,7 @@ def _parse_policy(spec: str) -> tuple[str, PolicyRow, str]:
     if not isinstance(result, type) or lacks:
         raise ConfigurationError(
             f"policy = {name!r} is not allowed: it must be a class with knowledge, reset and "
-            "__call__, as one derived from fusion_gym.policies.base.Rule"
+            "__call__, such as a subclass of fusion_gym.policies.base.Rule"
         )
     return name, PolicyRow(result), behind
 
@@ -297,6 +297,6 @@ def _try_out(spec: str, policy: Policy, task: Task) -> None:
     shape, kind = np.shape(requests), np.asarray(requests).dtype
     if shape != (task.sensors, 1) or kind != np.bool_:
         raise ConfigurationError(
-            f"policy {spec!r} requests with an array of {kind} {shape}: it must be bool "
+            f"policy {spec!r} returns an array of {kind} {shape}: it must be bool "
             f"({task.sensors}, 1), sensors and runs"
         )

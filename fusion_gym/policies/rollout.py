@@ -22,7 +22,7 @@ _LANES = 16384  # simulations in one batch, unless one run needs more
 
 
 class Rollout:
-    r"""Request the best first decision in simulations that continue with the policy ``base``.
+    r"""Request by the best first decision of simulations that continue with the policy `base`.
 
     At every step the first decisions are silence, each single sensor, and the base's requests.
     After each of them the base continues for ``steps`` steps, in ``samples`` simulations. The
@@ -102,12 +102,12 @@ class Rollout:
             raise validation.refusal(
                 "base",
                 base,
-                "a policy that looks at the signals of the present step alone, for it is asked in "
-                "the middle of simulated episodes",
+                "a policy that reads only signals of the present step, because simulated "
+                "episodes call it",
             )
         if owner_of(self.base) == "own":
             raise validation.refusal(
-                "base", base, "a scheduler's policy, for simulations begin with what it believes"
+                "base", base, "a scheduler's policy, because simulations begin with its belief"
             )
         memory = Memory(task, "scheduler")
         self._task = task

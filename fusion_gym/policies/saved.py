@@ -13,7 +13,7 @@ def saved_agent(
     *,
     trust: bool = False,
 ) -> Policy:
-    """Request as a Stable-Baselines3 model that is saved in a file.
+    """Request by a Stable-Baselines3 agent from a file.
 
     Args:
         task: the task; a text cannot set it.
@@ -33,7 +33,7 @@ def saved_agent(
 def zoo_agent(
     task: Task, name: str, deterministic: bool = True, price: float | None = None
 ) -> Policy:
-    """Request as an agent of the model zoo (:mod:`fusion_gym.zoo`).
+    """Request by an agent of the model zoo (:mod:`fusion_gym.zoo`).
 
     Args:
         task: the task; a text cannot set it.

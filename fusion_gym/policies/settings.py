@@ -33,6 +33,6 @@ def parse_settings(kind: str, entries: Iterable[str]) -> dict[str, Any]:
         if not equals or not key:
             raise ConfigurationError(f"{kind} {entry!r} is not allowed: write key=value")
         if key in result:
-            raise ConfigurationError(f"{kind} {key!r} is given twice")
+            raise ConfigurationError(f"{kind} {key!r} appears twice")
         result[key] = parse_value(value)
     return result

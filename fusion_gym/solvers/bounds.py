@@ -55,8 +55,8 @@ def lagrangian_bound(
     """
     if any(len(problem.tokens.level) > 1 for problem in problems):
         raise ConfigurationError(
-            "tokens = 'limited' is not allowed in the parts of the bound: each source must be "
-            "limited by its price alone"
+            "tokens = 'limited' is not allowed in the parts of the bound: only its price must "
+            "limit each source"
         )
     costs = validation.positive("spent", list(spent), (len(problems),)).tolist()
     gained = validation.number("rate", rate, at_least=0.0)

@@ -83,8 +83,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
 def _system(task: Task) -> RemoteEstimationSystem:
     if not isinstance(task.system, RemoteEstimationSystem):
         raise ConfigurationError(
-            f"system = {type(task.system).__name__} is not allowed: only remote estimation is "
-            "solved"
+            f"system = {type(task.system).__name__} is not allowed: it must be remote estimation"
         )
     return task.system
 
@@ -120,8 +119,7 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
             solution = solve_finite(problem, task.horizon, spread)
         if not solution.ordered:
             raise ConfigurationError(
-                "the optimum of this task asks for no thresholds on the error: it is not solved "
-                "here"
+                "this task is not solved: its optimum has no thresholds on the error"
             )
         costs.append(solution.cost)
         errors.append(problem.error_weight * solution.error)

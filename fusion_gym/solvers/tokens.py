@@ -43,7 +43,7 @@ class TokenLevels:
         if sensors > _MOST_SENSORS:
             raise ConfigurationError(
                 f"sensors = {sensors} is not allowed for the exact optimum under a common bucket: "
-                f"it must be at most {_MOST_SENSORS}, for all 2^{sensors} sets of sensors are "
+                f"it must be at most {_MOST_SENSORS}, because all 2^{sensors} sets of sensors are "
                 "choices"
             )
         choices = np.arange(2**sensors)

@@ -173,7 +173,7 @@ TABLE = {
         DQN, DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602", discrete_only=True
     ),
     "maskable_ppo": Algorithm(
-        MaskablePPO, PPOConfig, "PPO that cannot choose what the tokens do not allow",
+        MaskablePPO, PPOConfig, "PPO with a mask of the requests that the tokens deny",
         "S. Huang and S. Ontañón, arXiv 2006.14171",
     ),
     "ppo": Algorithm(

@@ -81,7 +81,7 @@ def read_journal(path: Path) -> Journal:
     except DAMAGED as error:
         reason = " ".join(str(error).split()).strip("'\"")
         raise ConfigurationError(
-            f"checkpoint = {str(path)!r} cannot be gone on with: {reason}"
+            f"checkpoint = {str(path)!r} cannot be continued: {reason}"
         ) from None
 
 

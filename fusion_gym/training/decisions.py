@@ -48,8 +48,8 @@ class Decisions:
             self.kind = kind or ("all" if few else "flips")
         if kind is not None and kind != self.kind:
             raise ConfigurationError(
-                f"alternatives = {kind!r} is not allowed here: it must be {self.kind!r}, for "
-                + ("sensors decide by themselves" if self.local else "an action is one number")
+                f"alternatives = {kind!r} is not allowed here: it must be {self.kind!r}, because "
+                + ("sensors decide locally" if self.local else "an action is one number")
             )
         self.choices = 2
         if self.kind == "all":
@@ -69,8 +69,8 @@ class Decisions:
         if self.binary:
             text, instead = ("alternatives = 'all'", "it must be 'flips'")
         raise ConfigurationError(
-            f"{text} is not allowed here with {self.sensors} sensors: all 2^{self.sensors} sets "
-            f"of requests would be stepped, of at most {MOST_SENSORS} sensors; {instead}"
+            f"{text} is not allowed here with {self.sensors} sensors: it steps all "
+            f"2^{self.sensors} sets of requests of at most {MOST_SENSORS} sensors; {instead}"
         )
 
     def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:

@@ -109,7 +109,7 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
     if env.task.access == "single":
         if sensors * rate >= 1.0:
             raise ConfigurationError(
-                f"initial_rate = {rate} is not allowed: it must be < 1/{sensors}, for one of "
+                f"initial_rate = {rate} is not allowed: it must be < 1/{sensors}, because one of "
                 f"{sensors} sensors transmits in a step"
             )
         return np.log([1.0 - sensors * rate, *[rate] * sensors])

@@ -40,8 +40,8 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
     if not resume:
         if holds_training(folder):
             raise ConfigurationError(
-                f"output = {str(folder)!r} holds a training already: go on with --resume, or give "
-                "another --output"
+                f"output = {str(folder)!r} already holds a training: continue with --resume, or "
+                "give another --output"
             )
         return None
     if checkpoint.exists():
@@ -164,7 +164,7 @@ def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
     """Return the summary of a training as text in a few lines."""
     lines = [
         f"{'finished' if summary['finished'] else 'interrupted'} after {summary['timesteps']:,} "
-        f"steps at {summary['steps_per_second']:,} steps/s; this stretch: {elapsed:.0f} s"
+        f"steps at {summary['steps_per_second']:,} steps/s; this session: {elapsed:.0f} s"
     ]
     total = sum(summary["seconds"].values())
     if total > 0.0:

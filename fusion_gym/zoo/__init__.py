@@ -43,8 +43,8 @@ def model_path(name: str) -> str:
     value = hashlib.sha256(path.read_bytes()).hexdigest()
     if value != text:
         raise ConfigurationError(
-            f"zoo = {name!r} is not allowed: {path} has the SHA-256 {value}, its card says {text}; "
-            "install fusion-gym anew"
+            f"zoo = {name!r} is not allowed: {path} has the SHA-256 {value}, its card says "
+            f"{text}; reinstall fusion-gym"
         )
     return str(path)
 

@@ -35,7 +35,7 @@ class Always(Rule):
 
 @dataclass
 class Never(Rule):
-    r"""Request no sensor, ever.
+    r"""Request no sensor.
 
     Equation:
         $$

@@ -71,8 +71,8 @@ class ValueOfInformation(BeliefRule):
         super().__post_init__()
         if self.threshold is not None and self.price is not None:
             raise ConfigurationError(
-                f"price = {self.price} is not allowed beside threshold = {self.threshold}: one of "
-                "them must be left out"
+                f"price = {self.price} is not allowed with threshold = {self.threshold}: leave "
+                "one of them out"
             )
 
     def __call__(self, signals: Signals) -> Requests:

@@ -77,9 +77,8 @@ def _system(task: Task) -> CensoredSystem:
     system: Any = task.system
     if not isinstance(system, CensoredSystem):
         raise ConfigurationError(
-            f"system = {type(system).__name__} is not allowed for the bound: its estimate from all "
-            "measurements must be that of a linear plant, as in TobitOscillator and the biased "
-            "systems"
+            f"system = {type(system).__name__} is not allowed for the bound: it must estimate a "
+            "linear plant from all measurements, as TobitOscillator and the biased systems do"
         )
     if system.model is not system.plant:
         raise ConfigurationError(
@@ -90,8 +89,8 @@ def _system(task: Task) -> CensoredSystem:
     if not _predicts(system.centre):
         raise ConfigurationError(
             "filter is not allowed for the bound: in silence the centre must predict, so neither "
-            "hold the last value (filter='paper' with silent='hold') nor read what silence says "
-            "(filter='stochastic')"
+            "hold the last value (filter='paper' with silent='hold') nor use the information of "
+            "silence (filter='stochastic')"
         )
     return system
 

@@ -33,7 +33,7 @@ FILTERS: dict[str, type] = {
     "centralised": CentralisedLinearFilter,
     "imm": InteractingModels,
 }
-_ESTIMATES_ALREADY = "packets carry the nodes' estimates already, which remember every measurement"
+_ESTIMATES_ALREADY = "packets already carry the nodes' estimates of all measurements"
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("joint covariance",))
 
 
@@ -186,9 +186,8 @@ def _fusion(kind: str | None, where: str, sensors: int) -> FusionRule | None:
     if where != "local":
         if kind is not None:
             raise ConfigurationError(
-                f"fusion = {kind!r} is not allowed with filter={where!r}: it must be left out, for "
-                "the centre takes the measurements themselves and has no estimates to fuse; it "
-                "belongs to filter='local'"
+                f"fusion = {kind!r} is not allowed with filter={where!r}: it must be left out, "
+                "because the centre fuses no estimates; it belongs to filter='local'"
             )
         return None
     return choose_rule("matrix" if kind is None else kind, _STRUCTURE, sensors)

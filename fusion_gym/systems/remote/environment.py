@@ -113,7 +113,7 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
         system,
         weights,
         nodes_have_memory=True,  # a source's value is all that there is to know of it
-        no_estimates="a packet carries the source's value itself",
+        no_estimates="a packet carries the source's value",
     )
 
 

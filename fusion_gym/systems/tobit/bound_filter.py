@@ -181,7 +181,7 @@ class BoundTobitFilter:
             raise ConfigurationError(
                 f"measurement_matrices with row ranks {ranks.tolist()} are not allowed with "
                 f"filter='paper', silent='hold': each must have its {self.sensors.size} rows "
-                "independent, since (37) has no noise term in the held update"
+                "independent, because the held update (37) has no noise term"
             )
 
     def expect(self, mean: Array) -> Expectation:

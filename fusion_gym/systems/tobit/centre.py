@@ -404,5 +404,5 @@ def _shifted(
 
 def _outcomes(prediction: CentrePrediction) -> Outcomes:
     if prediction.outcomes is None:
-        raise RuntimeError("the prediction has no outcomes: it was made by another centre")
+        raise RuntimeError("the prediction has no outcomes: another centre made it")
     return prediction.outcomes

@@ -303,8 +303,8 @@ class StochasticEventFilter(KalmanFilter):
         """
         if weight is None:
             raise ConfigurationError(
-                "stochastic_weight = None is not allowed with filter='stochastic': it must be the "
-                "weight of the policy 'stochastic_event', a number > 0 or one a sensor"
+                "stochastic_weight = None is not allowed with filter='stochastic': it must be "
+                "the weight of the policy 'stochastic_event', a number > 0, or one per sensor"
             )
         checked = validation.positive("stochastic_weight", weight, (sensors.count,))
         return cls(sensors, checked[:, None])

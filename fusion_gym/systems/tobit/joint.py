@@ -88,7 +88,7 @@ def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCen
     if channels > _MOST_CHANNELS:
         raise ConfigurationError(
             f"filter = 'joint' is not allowed with {sensors.count} sensors of {sensors.size} "
-            f"channels: together they may have at most {_MOST_CHANNELS}, for a step costs their "
-            "cube; where noises of different sensors are independent, 'kalman' is the same filter"
+            f"channels: together they may have at most {_MOST_CHANNELS}, because a step costs "
+            "their cube; with independent noises 'kalman' is the same filter"
         )
     return JointCentre(KalmanFilter(sensors), Feedback.in_full(sensors.count))

@@ -162,7 +162,7 @@ def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
     default = LinearFusionOptions.measurement_covariances
     if joint is not None and plain_options(own) != default:
         raise validation.refusal(
-            "measurement_covariances", own, "left out beside joint_measurement_covariance"
+            "measurement_covariances", own, "left out with joint_measurement_covariance"
         )
     return linear_sensors(
         states,
@@ -187,7 +187,7 @@ def _names(value: Any, states: int) -> tuple[str, ...]:
 
 def _check_rules(options: LinearFusionOptions) -> None:
     """Refuse a filter or a fusion that would count the sensors' common noise several times."""
-    why = "for the sensors' noises are correlated"
+    why = "because the sensors' noises are correlated"
     for name in ("filter", "memory_filter"):
         kind = getattr(options, name)
         if kind not in (None, "joint", "kalman"):

@@ -55,7 +55,7 @@ def linear_sensors(
                 raise validation.refusal(
                     f"measurement_covariances[{place}]" if whole is None else _JOINT,
                     covariance,
-                    f"diagonal for sensor {place}, which is censored, channel by channel",
+                    f"diagonal for the censored sensor {place}",
                 )
             factor, variances = linalg.cholesky(covariance[..., None])[..., 0], np.ones(size)
         matrix[place, :size] = np.linalg.solve(factor, rows[place])
@@ -66,7 +66,7 @@ def linear_sensors(
         return sensors
     if any(limited):
         raise validation.refusal(
-            _JOINT, joint, "without correlations between sensors, for some of them are censored"
+            _JOINT, joint, "without correlations between sensors, because some are censored"
         )
     scale = block_diag(*factors) * np.sqrt(variance[present])
     factor, places = np.eye(present.size), np.flatnonzero(present)

@@ -231,7 +231,7 @@ def refuse_fusion(options: FeedbackOptions, kind: str) -> None:
     Raises:
         ConfigurationError: such an option is set.
     """
-    belongs = "a filter with nodes (here the centre takes the measurements itself)"
+    belongs = "a filter with nodes (here the centre uses the measurements)"
     _refuse(options, _OF_FUSION, f"filter={kind!r}", belongs)
 
 

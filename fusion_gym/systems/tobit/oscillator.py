@@ -40,7 +40,7 @@ _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
 _SMALLEST_EPSILON = 1e-9
 _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
-_HELD = "the silent filter goes on from the last delivered measurement (silent='hold')"
+_HELD = "the silent filter continues from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
     "paper": Filter(
@@ -180,8 +180,8 @@ def _centre(choice: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
     for name, refused in (("silent", "hold"), ("event_error", True)):
         if choice.filter != "paper" and getattr(choice, name) == refused:
             raise ConfigurationError(
-                f"{name} = {refused!r} is not allowed with filter={choice.filter!r}: it belongs to "
-                "filter='paper' (the others predict when nothing arrives and know no event error)"
+                f"{name} = {refused!r} is not allowed with filter={choice.filter!r}: it belongs "
+                "to filter='paper' (the others predict in silence, without an event error)"
             )
     return centre
 

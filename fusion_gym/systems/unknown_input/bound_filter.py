@@ -105,8 +105,8 @@ class BoundTables:
             raise ConfigurationError(
                 f"young_factor = {validation.display(young_factor)} is not allowed for sensor "
                 f"{sensor}: the spectral radius of sqrt(1 + young_factor) (I - N C) A must be "
-                f"below 1, and is {radius[sensor]:.4g}, so that the bound grows without limit; "
-                "use a smaller factor, another sensor, or filter='random_walk'"
+                f"below 1, not {radius[sensor]:.4g}; use a smaller factor, another sensor, or "
+                "filter='random_walk'"
             )
         start = np.broadcast_to(
             model.initial_covariance, (count, *model.initial_covariance.shape)

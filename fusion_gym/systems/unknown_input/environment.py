@@ -157,13 +157,13 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
         raise ConfigurationError(
             f"input_signal = {validation.display(options.input_signal)} is not allowed with "
             f"input_amplitude = {validation.display(options.input_amplitude)}: every input must "
-            "differ from zero somewhere before the horizon, or there is nothing to estimate"
+            "differ from zero at some step before the horizon"
         )
     if np.any(open_loop <= 0.0):
         raise ConfigurationError(
             f"process_covariance = {validation.display(options.process_covariance)} is not "
-            "allowed: every state must be moved by the input or by noise before the horizon, or "
-            "be uncertain at the start"
+            "allowed: every state must have an input or noise before the horizon, or an "
+            "uncertain start"
         )
     weights = _weights(options, open_loop, plant.inputs)
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
@@ -184,7 +184,7 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
         weights,
         {"adaptive_threshold": trigger},
         memory_system=_with_memory_filter(options, system, sensors, horizon),
-        no_estimates="the centre makes its estimate anew from what each node sent",
+        no_estimates="the centre computes each estimate from the packets of the nodes",
     )
 
 
@@ -243,7 +243,7 @@ def _plant(options: UnknownInputOptions) -> UnknownInputPlant:
 
 def _required(value: ArrayLike | None) -> ArrayLike:
     """Return a number that the example has filled in."""
-    assert value is not None, "the examples give every number"
+    assert value is not None, "every example has all numbers"
     return value
 
 

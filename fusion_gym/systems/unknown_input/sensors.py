@@ -121,8 +121,7 @@ def _observable_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> t
     if rank < q:
         raise ConfigurationError(
             f"measurement_matrices[{sensor}] = {validation.display(matrix)} is not allowed: the "
-            "sensor must "
-            f"see every input, but rank(C B) is {rank} for {q} input{'s' if q > 1 else ''} (B is "
-            "the input matrix over one sampling interval)"
+            f"sensor must measure every input, but rank(C B) is {rank} for {q} "
+            f"input{'s' if q > 1 else ''} (B is the input matrix over one sampling interval)"
         )
     return right.T @ np.diag(1.0 / values) @ left[:, :q].T, left[:, q:]

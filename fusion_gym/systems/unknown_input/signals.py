@@ -245,7 +245,7 @@ def _scale_and_period(size: int, amplitude: ArrayLike, period: ArrayLike) -> tup
     if np.any(instants < 1.0):
         raise ConfigurationError(
             f"input_period = {validation.display(instants)} is not allowed: it must be >= 1 "
-            "everywhere, for an input is constant between two sampling instants"
+            "everywhere, because an input is constant between two sampling instants"
         )
     return scale[:, None], instants[:, None]
 
