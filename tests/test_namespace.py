@@ -95,6 +95,18 @@ def test_updates_equal_assignment(index: tuple[Any, ...]) -> None:
         np.testing.assert_array_equal(namespace.update_at(np.add, start(), index, 2.0), other)
 
 
+def test_functions_change_selected_runs_and_lanes_only() -> None:
+    array = np.random.default_rng(0).normal(size=(3, RUNS))
+    for mask in (array > 0.5, np.zeros_like(array, dtype=np.bool_)):
+        expected = np.where(mask, -array, array), np.where(mask.any(0), -array, array)
+        for to in (np.copy, jax.numpy.asarray):
+            values, selected = to(array), to(mask)
+            (lanes,) = namespace.in_lanes(selected, lambda x: [-x], [values], [to(array)], [9.0])
+            (runs,) = namespace.in_runs(selected, lambda x: [-x], [values], [to(array)])
+            np.testing.assert_array_equal(lanes, expected[0])
+            np.testing.assert_array_equal(runs, expected[1])
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_functions_can_be_traced(module: str) -> None:
     """Index writes stand only where JAX never calls: at LAPACK's stacks, and for pictures."""

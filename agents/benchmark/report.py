@@ -32,11 +32,7 @@ ERROR = "error a step, in the reward's weights"
 HEADLINE = "tobit_oscillator", "scheduler"  # the class of README's figure
 GAIN = 0.01  # a difference that the sentences name
 README = Path("README.md")
-TITLES = {
-    "centre": "fusion centre",
-    "local": "local sensors",
-    "scheduler": "centralised scheduler",
-}
+TITLES = {"centre": "fusion centre", "local": "local sensors", "scheduler": "centralised scheduler"}
 LINES = {  # kind: label, colour, marker
     "trigger": ("the paper's trigger, scaled", "tab:gray", "v"),
     "threshold": ("best rule with one threshold", "tab:blue", "o"),

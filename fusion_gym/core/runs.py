@@ -239,11 +239,7 @@ class Branch(Runs):
     """Independent runs that start at a :class:`Position` and take any noise; arrays are shared."""
 
     def __init__(
-        self,
-        task: Task,
-        memory: Memory,
-        layout: ObservationLayout,
-        position: Position,
+        self, task: Task, memory: Memory, layout: ObservationLayout, position: Position
     ) -> None:
         super().__init__(task, memory, layout)
         self.state, self.tokens, self.price = position[:3]

@@ -37,9 +37,7 @@ def silent_variances(problem: SourceProblem, longest: int) -> Array:
 
 
 def solve_ages(
-    problems: tuple[SourceProblem, ...],
-    at_most: int | None = None,
-    longest: int | None = None,
+    problems: tuple[SourceProblem, ...], at_most: int | None = None, longest: int | None = None
 ) -> AgeSolution:
     """Return the least average cost of policies that use only ages and losses.
 

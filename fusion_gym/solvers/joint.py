@@ -38,10 +38,7 @@ class JointProblem:
 
     @classmethod
     def create(
-        cls,
-        sources: tuple[SourceProblem, ...],
-        bucket: TokenBucket | None = None,
-        at_most: int = 2,
+        cls, sources: tuple[SourceProblem, ...], bucket: TokenBucket | None = None, at_most: int = 2
     ) -> JointProblem:
         """Return the checked problem; without a bucket the tokens are unlimited."""
         if len(sources) != 2:
@@ -128,9 +125,7 @@ class JointAverageSolution:
     grids: tuple[ErrorGrid, ErrorGrid]
 
 
-def solve_joint_average(
-    problem: JointProblem,
-) -> JointAverageSolution:
+def solve_joint_average(problem: JointProblem) -> JointAverageSolution:
     """Return the least average cost by relative value iteration, to a relative 1e-6."""
     bellman = JointBellman(problem, problem.grids())
     lower, upper, choice = iterate_values(bellman.decide, bellman.shape, _TOLERANCE, _ITERATIONS)
@@ -150,9 +145,7 @@ class JointFiniteSolution:
 
 
 def solve_joint_finite(
-    problem: JointProblem,
-    horizon: int,
-    initial_deviation: tuple[float, float] = (0.0, 0.0),
+    problem: JointProblem, horizon: int, initial_deviation: tuple[float, float] = (0.0, 0.0)
 ) -> JointFiniteSolution:
     """Return the least expected cost of ``horizon`` steps by dynamic programming."""
     steps = validation.integer("horizon", horizon, at_least=1)

@@ -11,12 +11,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
-from fusion_gym.solvers.single import (
-    AverageSolution,
-    FiniteSolution,
-    solve_average,
-    solve_finite,
-)
+from fusion_gym.solvers.single import AverageSolution, FiniteSolution, solve_average, solve_finite
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.systems.remote.system import RemoteEstimationSystem

@@ -66,12 +66,7 @@ def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, T
     return make_model(experiment, env), env, task
 
 
-def train(
-    experiment: Experiment,
-    *,
-    resume: bool = False,
-    quiet: bool = False,
-) -> dict[str, Any]:
+def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
     """Run the training and return its summary.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (over

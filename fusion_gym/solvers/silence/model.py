@@ -11,11 +11,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
-from fusion_gym.systems.tobit.centre import (
-    Centre,
-    NodeCentre,
-    SequentialCentre,
-)
+from fusion_gym.systems.tobit.centre import Centre, NodeCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.validation import ConfigurationError

@@ -133,9 +133,7 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     return Scenario(options, system, weights, {"adaptive_innovation": trigger})
 
 
-def _plant_and_sensors(
-    options: CorrelatedTrackingOptions,
-) -> tuple[LinearPlant, CorrelatedSensors]:
+def _plant_and_sensors(options: CorrelatedTrackingOptions) -> tuple[LinearPlant, CorrelatedSensors]:
     """Return plant and sensors at the bounds; both use the same process normals."""
     size = len(validation.array("transition", options.transition, (None, None)))
     validation.array("transition", options.transition, (size, size))

@@ -63,9 +63,7 @@ class CorrelatedSensors:
         )
         sensors, size, _ = matrix.shape
         variance = validation.positive(
-            "measurement_variance",
-            _one_each(measurement_variance, sensors, 1),
-            (sensors, size),
+            "measurement_variance", _one_each(measurement_variance, sensors, 1), (sensors, size)
         )
         beta = validation.spread(
             "noise_coupling",

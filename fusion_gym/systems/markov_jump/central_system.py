@@ -35,11 +35,7 @@ from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.systems.markov_jump.state import (
-    OF_FAMILY,
-    MarkovJumpFamily,
-    sampling_blocks,
-)
+from fusion_gym.systems.markov_jump.state import OF_FAMILY, MarkovJumpFamily, sampling_blocks
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 

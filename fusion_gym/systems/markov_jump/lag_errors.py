@@ -14,11 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.markov_jump.linear_minimum_variance import (
-    ROUNDING,
-    LocalFilters,
-    Times,
-)
+from fusion_gym.systems.markov_jump.linear_minimum_variance import ROUNDING, LocalFilters, Times
 
 
 class LagCovariances(NamedTuple):

@@ -325,12 +325,7 @@ def settled(now: tuple[Array, ...], before: tuple[Array, ...]) -> bool:
 
 
 def _advance(
-    model: AugmentedModel,
-    step: AugmentedStep,
-    joint: Array,
-    shared: Array,
-    noise: Array,
-    time: int,
+    model: AugmentedModel, step: AugmentedStep, joint: Array, shared: Array, noise: Array, time: int
 ) -> tuple[_Row, Array]:
     """Return one time's row of the tables, and the next joint prediction covariance."""
     sensors, transition, faded = model.sensors, model.transition, model.faded

@@ -101,9 +101,7 @@ def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
     since = "steps since the sensor's last sampling time over its period"
     return (
         own(
-            "sampled",
-            "whether the sensor samples at this step",
-            lambda s: sensors.sampled(s.time),
+            "sampled", "whether the sensor samples at this step", lambda s: sensors.sampled(s.time)
         ),
         own("phase", since, lambda s: (s.time % sensors.period) / sensors.period),
     )

@@ -79,10 +79,7 @@ class LinearFusionOptions(FeedbackOptions):
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
     """A of x(t+1) = A x(t) + w(t), (n, n)."""
-    process_covariance: ArrayLike = (
-        (_STEP**3 / 3.0, _STEP**2 / 2.0),
-        (_STEP**2 / 2.0, _STEP),
-    )
+    process_covariance: ArrayLike = ((_STEP**3 / 3.0, _STEP**2 / 2.0), (_STEP**2 / 2.0, _STEP))
     """Covariance W of the process noise w, (n, n)."""
     initial_mean: ArrayLike | None = None
     """Mean of x₀, (n,). By default 0."""

@@ -99,11 +99,7 @@ class InputModel:
 
     @classmethod
     def create(
-        cls,
-        plant: UnknownInputPlant,
-        memory: ArrayLike,
-        change: ArrayLike,
-        deviation: ArrayLike,
+        cls, plant: UnknownInputPlant, memory: ArrayLike, change: ArrayLike, deviation: ArrayLike
     ) -> InputModel:
         """Return the model of a plant's input.
 
