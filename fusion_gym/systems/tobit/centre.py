@@ -180,7 +180,8 @@ class FeedbackCentre(NodeCentre):
         root = linalg.root(self.sensors.regular(covariance))
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
         deviation = _deviation(self.sensors, expectation, (observed * observed).sum(-2))
-        inflated = observed / np.sqrt(self.feedback.share)[:, None, None]
+        share = self.feedback.share[:, None, None]
+        inflated = observed / namespace(share).sqrt(share)
         outcomes = self.filter.outcomes(inflated, expectation, held, time)
         return CentrePrediction(expectation, deviation, root, outcomes)
 
@@ -222,7 +223,8 @@ class FeedbackCentre(NodeCentre):
         innovation = measurement - prediction.expectation.value
         delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
         local = namespace(granted).where(granted[:, None], delivered, outcomes.silent_mean)
-        return local / np.sqrt(self.feedback.share[:, None])
+        share = self.feedback.share[:, None]
+        return local / namespace(share).sqrt(share)
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array

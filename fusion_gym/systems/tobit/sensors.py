@@ -167,8 +167,9 @@ class CensoredSensors:
         """
         information = (self.measurement_matrix**2 / self.variance[:, :, None]).sum((0, 1))
         observed = information > 0.0
-        values = 1.0 / np.where(observed, information, np.inf)
-        return np.where(observed, values, values.max() if observed.any() else np.inf)
+        xp = namespace(information)
+        values = 1.0 / xp.where(observed, information, np.inf)
+        return xp.where(observed, values, xp.where(observed.any(), values.max(), np.inf))
 
     def regular(self, covariance: Array) -> Array:
         """Return a regular bound of the covariance (n, n, N), larger by its rounding.

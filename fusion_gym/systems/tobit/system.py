@@ -4,10 +4,13 @@ Source: tobit_token_bucket (Chen, Han, Song and Zhang, Complex Eng. Syst. 4:19, 
 round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +30,7 @@ from fusion_gym.core.system import (
 )
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
-from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
+from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, Feedback
 
 _TINY = float(np.finfo(float).tiny)  # stands for a variance of zero
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
@@ -89,7 +92,7 @@ class CensoredSystem(System[CensoredState]):
     nature: Nature = AS_ASSUMED
     known_start: bool = False
     signals = SIGNALS
-    extensions = ("state_weights",)
+    extensions = ("state_weights", "with_model")
 
     @property
     def sensor_count(self) -> int:
@@ -111,6 +114,35 @@ class CensoredSystem(System[CensoredState]):
         """Normals of a start: direction, deviation, noise of the first measurement, nature's."""
         own = 2 * self.plant.size + self.centre.sensors.noise_channels
         return own + self.nature.channels
+
+    def with_model(
+        self,
+        process_covariance: Array | None = None,
+        measurement_variance: Array | None = None,
+        information_shares: Array | None = None,
+    ) -> CensoredSystem:
+        """Return the system with other parameters of its filters; the truth stays.
+
+        Arrays of JAX allow derivatives with respect to them.
+
+        Args:
+            process_covariance: W (n, n).
+            measurement_variance: R (sensors, m).
+            information_shares: (sensors,), of sum 1.
+        """
+        model, centre = self.model, self.centre
+        if process_covariance is not None:
+            model = replace(model, process_covariance=process_covariance[..., None])
+        if measurement_variance is not None:
+            variance = measurement_variance[..., None]
+            deviation = namespace(variance).sqrt(variance)
+            sensors = replace(centre.sensors, variance=variance, deviation=deviation)
+            node: Any = cast(Any, centre).filter
+            centre = replace(cast(Any, centre), filter=replace(node, sensors=sensors))
+        if information_shares is not None:
+            feedback = Feedback(information_shares[:, None])
+            centre = replace(cast(Any, centre), feedback=feedback)
+        return replace(self, model=model, centre=centre)
 
     def offers(self, capability: str) -> bool:
         """See :class:`System`; Kalman filters without censoring have a covariance cycle.
