@@ -14,7 +14,7 @@ from fusion_gym.validation import ConfigurationError
 from fusion_gym.version import __version__
 
 if TYPE_CHECKING:
-    from fusion_gym import evaluation, zoo
+    from fusion_gym import evaluation, jax, zoo
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.privileged import make_sb3_vec_env
     from fusion_gym.envs.sb3 import FusionSB3VecEnv
@@ -29,6 +29,7 @@ __all__ = [
     "FusionVectorEnv",
     "__version__",
     "evaluation",
+    "jax",
     "make_policy",
     "make_sb3_vec_env",
     "make_task",
@@ -69,6 +70,6 @@ if not TYPE_CHECKING:  # type checkers see only the names above
             except ModuleNotFoundError as error:
                 missing = f"{error}: pip install 'fusion-gym[agents]'"
                 raise ModuleNotFoundError(missing, name=error.name) from None
-        if name in ("evaluation", "zoo"):
+        if name in ("evaluation", "jax", "zoo"):
             return importlib.import_module(f"{__name__}.{name}")
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

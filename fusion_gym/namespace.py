@@ -157,7 +157,7 @@ def ranked_sum(values: Any, place: Any) -> Any:
     """Return for each entry (rows, N) the sum of a run's entries up to its place, a permutation."""
     xp = namespace(values, place)
     if xp is not np:
-        return gather(xp.cumsum(permute(values, place), axis=0), place)
+        return take_rows(xp.cumsum(permute(values, place), axis=0), place)
     total, place = np.empty(values.shape), place * values.shape[1] + np.arange(values.shape[1])
     total.reshape(-1)[place] = values
     return np.cumsum(total, axis=0).take(place)
@@ -173,7 +173,7 @@ def permute(values: Any, place: Any) -> Any:
     return result
 
 
-def gather(values: Any, place: Any) -> Any:
+def take_rows(values: Any, place: Any) -> Any:
     """Return the entries (rows, N) of ``values`` at the rows ``place`` (rows, N) of each run."""
     xp = namespace(values, place)
     if xp is not np:

@@ -22,7 +22,7 @@ def paths(owners: list[object]) -> set[str]:
 
 
 def test_the_reference_has_every_public_name() -> None:
-    modules = {"evaluation", "zoo"}
+    modules = {"evaluation", "jax", "zoo"}
     names = {f"fusion_gym.{name}" for name in {*fusion_gym.__all__} - modules - {"__version__"}}
     names |= {f"fusion_gym.evaluation.{name}" for name in evaluation.__all__}
     names |= paths([options_of(env_id) for env_id in ENVIRONMENTS])

@@ -150,7 +150,7 @@ class Runs:
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
         """Return independent copies of ``runs``, possibly repeated, by default of all."""
         memory = self.memory.branch(runs, len(self.steps))
-        return Branch(self.task, memory, self.layout, self._position(runs))
+        return Branch(self.task, memory, self.layout, self.position(runs))
 
     def branch_memory(self, runs: NDArray[np.int64]) -> Branch:
         """Return independent runs of a scheduler whose x* is known.
@@ -161,11 +161,12 @@ class Runs:
         Args:
             runs: Numbers of the runs.
         """
-        position = self._position(runs)
+        position = self.position(runs)
         memory = self.memory.with_best(position.state, take_runs(self.beliefs().best, runs))
         return Branch(self.task, memory, self.layout, position)
 
-    def _position(self, runs: NDArray[np.int64] | None) -> Position:
+    def position(self, runs: NDArray[np.int64] | None = None) -> Position:
+        """Return the state of ``runs``, possibly repeated, by default of all."""
         if runs is None:
             return Position(
                 self.state,

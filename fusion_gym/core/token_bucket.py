@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import SharingRule
-from fusion_gym.namespace import gather, namespace, permute, ranked_sum
+from fusion_gym.namespace import namespace, permute, ranked_sum, take_rows
 from fusion_gym.validation import ConfigurationError
 
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
@@ -188,7 +188,7 @@ class TokenBucket:
         first = step if self.sharing == "rotating" else 0 * step
         order = (np.arange(count)[:, None] + first) % count
         cost, answers = xp.asarray(self.cost)[order, 0], []
-        for request, price in zip(gather(requests, order), cost, strict=True):
+        for request, price in zip(take_rows(requests, order), cost, strict=True):
             answers.append(request & (price <= left))
             left = left - answers[-1] * price
         return permute(xp.stack(answers), order)

@@ -228,15 +228,15 @@ class CensoredSystem(System[CensoredState]):
         """Draw the initial state; every first measurement is known without charge."""
         n, sensors = self.plant.size, self.centre.sensors
         noise, departure = self.nature.begin(noise)
-        mean = np.broadcast_to(self.plant.initial_mean, (n, noise.shape[-1])).copy()
+        xp, runs = namespace(noise), noise.shape[-1]
+        mean = xp.array(np.broadcast_to(self.plant.initial_mean, (n, runs)))
         if self.random_start:
-            direction = noise[:n] / np.sqrt(linalg.dot(noise[:n], noise[:n]))
-            mean = np.sqrt(linalg.dot(mean, mean)) * direction
+            direction = noise[:n] / linalg.dot(noise[:n], noise[:n]) ** 0.5
+            mean = xp.sqrt(linalg.dot(mean, mean)) * direction
         truth = self.plant.start(mean, noise[n : 2 * n])
         own = true_noise(departure, noise[:0], noise[2 * n :])[1]
         measurement = sensors.measure(truth, own, departure)
-        runs = noise.shape[-1]
-        covariance = np.broadcast_to(self.model.initial_covariance, (n, n, runs)).copy()
+        covariance = xp.array(np.broadcast_to(self.model.initial_covariance, (n, n, runs)))
         first = CensoredState(
             truth=truth,
             measurement=measurement,
@@ -253,7 +253,7 @@ class CensoredSystem(System[CensoredState]):
         if not self.known_start:
             return first
         prediction = self.centre.predict(mean, covariance, measurement, first.time)
-        everyone = np.ones((sensors.count, runs), dtype=np.bool_)
+        everyone = xp.ones((sensors.count, runs), dtype=np.bool_)
         result = self.deliver(replace(first, prediction=prediction), everyone)
         return replace(result, prediction=None)
 

@@ -59,7 +59,7 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
     high = (sensors.upper - latent) / deviation
     moments = gaussian.interval_moments(low, high)
     below, above = gaussian.upper_tail(-low), gaussian.upper_tail(high)
-    xp, inside = namespace(latent), moments.probability
+    xp, inside = namespace(latent, deviation), moments.probability
     centre = latent + deviation * moments.mean
     to_low = xp.where(np.isinf(sensors.threshold), 0.0, centre - sensors.finite_threshold)
     to_high = xp.where(np.isinf(sensors.upper), 0.0, sensors.finite_upper - centre)
