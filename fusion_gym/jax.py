@@ -21,6 +21,7 @@ from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.runs import Branch, Outcome, Position
+from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.views import SchedulerView
@@ -209,6 +210,15 @@ class FunctionalEnv:
         runs = self._runs(self._task(params), state)
         outcome = runs.step(self.requests(action), cast(Any, jnp.asarray(noise)))
         return runs.observe()[0], runs.position(), outcome
+
+    def signals(self, state: Position, params: EnvParams | None = None) -> Signals:
+        """Return the signals of a state, for ``innovation_threshold`` and other rules.
+
+        Args:
+            state: State of the run; axes N have the length 1.
+            params: Parameters, by default of the options.
+        """
+        return self._runs(self._task(params), state).signals()
 
     def requests(self, action: Any) -> Any:
         """Return the requests (sensors, 1) bool of an action of :meth:`action_space`."""

@@ -14,6 +14,13 @@ from fusion_gym.jax import FunctionalEnv
 from fusion_gym.validation import ConfigurationError
 
 HORIZON, EPISODES = 30, 3
+RULES = (
+    "innovation_threshold:threshold=1.1",
+    "innovation_threshold:threshold=1.1,whitened=true,at_most=1",
+    "send_on_delta:threshold=0.9",
+    "information_gain:threshold=0.03,at_most=none",
+    "information_gain:threshold=0.01",
+)
 
 
 @pytest.mark.parametrize(("name", "options"), TASKS)
@@ -24,6 +31,8 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
     space = env.action_space()
     space.seed(0)
     reset, step = jax.jit(env.reset_env), jax.jit(env.step_env)
+    rules = [fusion_gym.make_policy(text, task) for text in RULES]
+    decide = jax.jit(lambda state: [rule(env.signals(state)) for rule in rules])
     batch = EpisodeBatch(task, 1)
     batch.seed(np.arange(1), [7])
     for episode in range(EPISODES):
@@ -34,6 +43,8 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
         observation, state = reset(start, noise[0], uniform)
         for place in range(HORIZON):
             np.testing.assert_allclose(observation, batch.observe()[0], rtol=1e-6, atol=1e-6)
+            for rule, requests in zip(rules, decide(state), strict=True):
+                np.testing.assert_array_equal(requests, rule(batch.signals()))
             action = space.sample()
             outcome = batch.step(np.asarray(env.requests(action)))
             observation, state, result = step(noise[place + 1], state, action)

@@ -14,6 +14,7 @@ from fusion_gym.core.memory import Owner
 from fusion_gym.core.signals import MEMORY_SIGNALS, PLANNING_SIGNALS
 from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signal, Signals, covers, least_covering
 from fusion_gym.core.task import Task
+from fusion_gym.namespace import namespace
 
 Requests = NDArray[np.bool_]
 PerSensor = float | tuple[float, ...]
@@ -183,8 +184,7 @@ def strongest(score: Array, requests: Requests, at_most: int | None, age: Array)
     sensors = len(score)
     if at_most is None or at_most >= sensors:
         return requests
-    ranked = np.where(requests, score, -np.inf)
-    order = np.lexsort((-age, -ranked), axis=0)
-    selected = np.zeros_like(requests)
-    np.put_along_axis(selected, order[:at_most], True, axis=0)
-    return selected & requests
+    xp = namespace(score, requests)
+    ranked = xp.where(requests, score, -np.inf)
+    order = xp.lexsort((-age, -ranked), axis=0)
+    return requests & (xp.argsort(order, axis=0) < at_most)

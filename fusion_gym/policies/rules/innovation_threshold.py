@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from fusion_gym import validation
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
@@ -58,6 +56,6 @@ class InnovationThreshold(Rule):
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
-        norm = np.sqrt(surprise(signals, self.whitened))
+        norm = surprise(signals, self.whitened) ** 0.5
         requests = norm >= self.column("threshold", len(norm))
         return strongest(norm, requests, self.at_most, signals["age"])
