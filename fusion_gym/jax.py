@@ -251,6 +251,40 @@ class FunctionalEnv:
         return dataclasses.replace(self.task, system=self.task.system.with_model(**changed))
 
 
+class FiveValueEnv(FunctionalEnv):
+    """An environment with the ``step`` of gymnax before version 1.
+
+    Args:
+        task: The task, without memory.
+
+    Raises:
+        ConfigurationError: The task does not run under JAX.
+
+    Example:
+        >>> import fusion_gym.jax, jax
+        >>> task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", action="discrete")
+        >>> env, key = fusion_gym.jax.FiveValueEnv(task), jax.random.key(0)
+        >>> observation, state, reward, done, info = env.step(key, env.reset(key)[1], 3)
+        >>> bool(done)
+        False
+    """
+
+    def step(  # type: ignore[override]
+        self, key: Any, state: Position, action: Any, params: EnvParams | None = None
+    ) -> tuple[Any, Position, Any, Any, dict[str, Any]]:
+        """Return observation, state, reward, done and info of a step.
+
+        Args:
+            key: Key of ``jax.random``.
+            state: State of the run.
+            action: Action of :meth:`action_space`.
+            params: Parameters, by default of the options.
+        """
+        *values, terminated, truncated, info = super().step(key, state, action, params)
+        info |= {"terminated": terminated, "truncated": truncated}
+        return values[0], values[1], values[2], terminated | truncated, info
+
+
 def refuse(task: Task) -> None:
     """Refuse a task that does not run under JAX.
 
