@@ -12,12 +12,7 @@ from training_configs import small_config
 ENV = "fusion_gym/TobitOscillator-v1"
 
 
-def arguments(
-    command: str,
-    folder: Path,
-    seed: int = 0,
-    steps: int = 256,
-) -> list[str]:
+def arguments(command: str, folder: Path, seed: int = 0, steps: int = 256) -> list[str]:
     """Return the words of a short run into the folder; the seed makes another run."""
     if command == "evaluate":
         options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]

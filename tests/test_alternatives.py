@@ -11,11 +11,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.runs import Branch
 from fusion_gym.core.task import Task
-from fusion_gym.envs.privileged import (
-    PrivilegedVecEnv,
-    make_sb3_vec_env,
-    reference_system,
-)
+from fusion_gym.envs.privileged import PrivilegedVecEnv, make_sb3_vec_env, reference_system
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
@@ -108,9 +104,7 @@ def test_grants_of_many_sensors_are_reported_apart(sensors: int) -> None:
         np.testing.assert_array_equal(values.error[:, place], outcome.error)
 
 
-def test_requests_that_are_answered_alike_are_stepped_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_requests_that_are_answered_alike_are_stepped_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody is granted anything without tokens, and what was taken is known already."""
     task = fusion_gym.make_task(OSCILLATOR, token_rate=0.5, initial_tokens=3.0, sharing="rotating")
     batch = EpisodeBatch.seeded(task, 2, 0)

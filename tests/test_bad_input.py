@@ -120,11 +120,7 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("RemoteEstimation", {"drop_probability": 0.1}, ()),
     ("RemoteEstimation", {"channel_transition": np.eye(2), "channel": "independent"}, ()),
     ("RemoteEstimation", GILBERT_ELLIOTT | {"channel_transition": ((0.5, 0.4), (0, 1))}, ()),
-    (
-        "RemoteEstimation",
-        GILBERT_ELLIOTT | {"channel_transition": np.eye(2)},
-        ("initial_channel",),
-    ),
+    ("RemoteEstimation", GILBERT_ELLIOTT | {"channel_transition": np.eye(2)}, ("initial_channel",)),
     # Packets and memory
     ("TobitOscillator", {"broadcast": "none"}, ("broadcast = 'none'", "'estimate' or 'packets'")),
     ("TobitOscillator", MEMORY | {"information": "centre"}, ("memory = True", "must be False")),
@@ -146,11 +142,7 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     # Systems of one's own
     ("LinearFusion", {"measurement_matrices": []}, ("measurement_matrices = []",)),
     ("LinearFusion", {"measurement_matrices": 3}, ("a list with a matrix for each sensor",)),
-    (
-        "LinearFusion",
-        {"measurement_matrices": [[1, 0], [[1, 0, 0]]]},
-        ("measurement_matrices[1]",),
-    ),
+    ("LinearFusion", {"measurement_matrices": [[1, 0], [[1, 0, 0]]]}, ("measurement_matrices[1]",)),
     ("LinearFusion", {"state_names": ["a", "a"]}, ("2 different words",)),
     ("LinearFusion", {"state_names": ["a", "b", "a"]}, ("2 different words",)),
     ("LinearFusion", {"state_names": ["a", "b,c"]}, ("2 different words",)),

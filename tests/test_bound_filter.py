@@ -94,10 +94,7 @@ def test_event_error_follows_its_recursion_for_every_growth(decay: float) -> Non
 
 @pytest.mark.parametrize(
     ("change", "field"),
-    [
-        ({"threshold": -0.1}, "trigger_threshold"),
-        ({"young": (0.0, 1.0)}, "bound_young"),
-    ],
+    [({"threshold": -0.1}, "trigger_threshold"), ({"young": (0.0, 1.0)}, "bound_young")],
 )
 def test_bad_trigger_numbers_are_refused(change: dict[str, Any], field: str) -> None:
     with pytest.raises(ConfigurationError, match=rf"^{field} = .* is not allowed"):

@@ -118,10 +118,7 @@ def reference(
     ],
 )
 def test_library_and_plain_loop_walk_the_same_trajectories(
-    fusion: str,
-    order: tuple[int, ...] | None,
-    scale: float,
-    rate: float | None,
+    fusion: str, order: tuple[int, ...] | None, scale: float, rate: float | None
 ) -> None:
     task = build(fusion=fusion, order=order, noise_scale=scale)
     system, runs, steps = task.system, 3, 150

@@ -7,10 +7,7 @@ import pytest
 from difficult_estimates import KINDS, Array, estimates, parts
 from scipy.optimize import minimize_scalar
 
-from fusion_gym.fusion.intersection import (
-    covariance_intersection,
-    inverse_covariance_intersection,
-)
+from fusion_gym.fusion.intersection import covariance_intersection, inverse_covariance_intersection
 from fusion_gym.fusion.rules import InformationFusion
 
 RULES = {"ci": covariance_intersection, "ici": inverse_covariance_intersection}

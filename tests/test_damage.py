@@ -22,10 +22,7 @@ DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
     ),
 }
 # The files without which a command cannot go on.
-READ: dict[str, tuple[str, ...]] = {
-    "train": ("run/latest.zip",),
-    "evaluate": ("result.json",),
-}
+READ: dict[str, tuple[str, ...]] = {"train": ("run/latest.zip",), "evaluate": ("result.json",)}
 # Those that it writes anew.
 WRITTEN = {
     "train": (

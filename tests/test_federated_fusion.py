@@ -75,11 +75,7 @@ def test_uncensored_federation_is_the_centralised_kalman_filter(
 
 @pytest.mark.parametrize(
     ("share", "reason"),
-    [
-        ((0.5, 0.3, 0.3), "sum 1"),
-        ((1.2, -0.1, -0.1), "> 0"),
-        ((0.5, 0.5), "shape"),
-    ],
+    [((0.5, 0.3, 0.3), "sum 1"), ((1.2, -0.1, -0.1), "> 0"), ((0.5, 0.5), "shape")],
 )
 def test_bad_shares_are_refused(share: Any, reason: str) -> None:
     with pytest.raises(ConfigurationError) as refused:

@@ -118,12 +118,7 @@ def test_tobit_moments_are_the_single_functions(shape: tuple[int, ...]) -> None:
     moments = gaussian.tobit_moments(z)
     for actual, function in zip(
         moments,
-        (
-            gaussian.upper_tail,
-            gaussian.hazard,
-            excess_beyond,
-            gaussian.truncated_variance,
-        ),
+        (gaussian.upper_tail, gaussian.hazard, excess_beyond, gaussian.truncated_variance),
         strict=True,
     ):
         assert actual.shape == shape

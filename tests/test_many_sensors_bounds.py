@@ -72,10 +72,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
         lambda: TokenLevels.create(TokenBucket.create(1.0, 13.0, 1.0, 1.0, sensors=13)),
         r"sensors = 13 .*at most 12.*2\^13",
     ),
-    "ages": (
-        lambda: solve_ages(source_problems(sources(60)), longest=1),
-        r"60 sources.*2\^60",
-    ),
+    "ages": (lambda: solve_ages(source_problems(sources(60)), longest=1), r"60 sources.*2\^60"),
     "sensors": (lambda: sources(1001), r"sensors = 1001.*<= 1000"),
 }
 

@@ -291,10 +291,7 @@ HEAD, FIRST = "action_net.weight", "mlp_extractor.policy_net.0.weight"
     ids=["missing", "extra", "float64", "shape", "sparse", "huge", "wide", "nan", "list", "many"],
 )
 def test_weights_of_no_such_policy_are_refused(
-    saved: Callable[[str], Saved],
-    tmp_path: Path,
-    change: Callable[[Weights], Any],
-    reason: str,
+    saved: Callable[[str], Saved], tmp_path: Path, change: Callable[[Weights], Any], reason: str
 ) -> None:
     agent = saved("ppo")
     weights = dumped(change(dict(agent.model.policy.state_dict())))

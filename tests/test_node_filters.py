@@ -6,12 +6,7 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from filter_problems import (
-    Array,
-    Problem,
-    outcomes,
-    random_problem,
-)
+from filter_problems import Array, Problem, outcomes, random_problem
 from filterpy.kalman import KalmanFilter as FilterPyFilter
 
 from fusion_gym.systems.tobit.filters import KalmanFilter

@@ -28,12 +28,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.docstrings import read
 from fusion_gym.policies.base import Rule
 from fusion_gym.policies.belief_rule import BeliefRule
-from fusion_gym.policies.registry import (
-    make_policy,
-    policy_maker,
-    policy_names,
-    register_policy,
-)
+from fusion_gym.policies.registry import make_policy, policy_maker, policy_names, register_policy
 from fusion_gym.validation import ConfigurationError
 
 ENVIRONMENTS: dict[str, tuple[str, Values]] = {

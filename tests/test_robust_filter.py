@@ -25,12 +25,7 @@ BETA = np.array([0.2, 0.4, 0.1])
 
 
 def parts(
-    transition: Array,
-    gain: Array,
-    process: Array,
-    matrices: Array,
-    variance: Any,
-    coupling: Any,
+    transition: Array, gain: Array, process: Array, matrices: Array, variance: Any, coupling: Any
 ) -> tuple[LinearPlant, CorrelatedSensors]:
     """A plant with noise gain Γ and noise variances (r,), and its sensors."""
     n = len(transition)

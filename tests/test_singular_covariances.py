@@ -11,10 +11,7 @@ import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.fusion.intersection import (
-    covariance_intersection,
-    inverse_covariance_intersection,
-)
+from fusion_gym.fusion.intersection import covariance_intersection, inverse_covariance_intersection
 from fusion_gym.fusion.table import RULES
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.systems.unknown_input.fusion import tracked_intersection

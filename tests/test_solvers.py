@@ -19,11 +19,7 @@ from fusion_gym.solvers.ages import solve_ages
 from fusion_gym.solvers.bounds import lagrangian_bound
 from fusion_gym.solvers.grid import gaussian_rows
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
-from fusion_gym.solvers.single import (
-    solve_average,
-    solve_discounted,
-    solve_finite,
-)
+from fusion_gym.solvers.single import solve_average, solve_discounted, solve_finite
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.task import solve_task, source_problems
 from fusion_gym.solvers.tokens import TokenLevels

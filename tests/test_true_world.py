@@ -116,10 +116,7 @@ class TestNoise:
     def test_shared_noise_multiplies_the_scale(self) -> None:
         """In correlated tracking the sensors' noise has a part of the plant's, which grows too."""
         _, states = sensed(
-            CORRELATED,
-            noise_scale=0.5,
-            true_process_noise=3.0,
-            true_measurement_noise=2.0,
+            CORRELATED, noise_scale=0.5, true_process_noise=3.0, true_measurement_noise=2.0
         )
         shaken = states[1].measurement[:, 0] - states[1].truth
         for sensor, (variance, coupling) in enumerate(

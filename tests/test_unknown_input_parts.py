@@ -76,9 +76,7 @@ def test_gain_hides_the_input_and_is_the_textbooks(seed: int, q: int, size: int)
         through[:, :4], np.broadcast_to(plant.input_matrix, through[:, :4].shape), atol=1e-9 * scale
     )
     np.testing.assert_allclose(
-        through[:, 4:],
-        np.broadcast_to(linalg.identity(q), through[:, 4:].shape),
-        atol=1e-9 * scale,
+        through[:, 4:], np.broadcast_to(linalg.identity(q), through[:, 4:].shape), atol=1e-9 * scale
     )
     for sensor in range(3):
         n, left = textbook_gain(

@@ -46,8 +46,7 @@ def test_it_grows_with_the_error_without_end() -> None:
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"channel": "gilbert_elliott", "cost_weight": 20.0}, {"channel": "independent"}],
+    "options", [{}, {"channel": "gilbert_elliott", "cost_weight": 20.0}, {"channel": "independent"}]
 )
 def test_one_source_at_a_price_is_solved_by_it(options: dict[str, Any]) -> None:
     """Paired over 400 episodes; the optimum is flat, the interpolation costs little."""

@@ -10,11 +10,7 @@ import mo_gymnasium
 import numpy as np
 import pytest
 import torch
-from mo_gymnasium.wrappers import (
-    MOClipReward,
-    MONormalizeReward,
-    MORecordEpisodeStatistics,
-)
+from mo_gymnasium.wrappers import MOClipReward, MONormalizeReward, MORecordEpisodeStatistics
 from mo_gymnasium.wrappers.vector import MORecordEpisodeStatistics as VectorStatistics
 from mo_gymnasium.wrappers.vector import MOSyncVectorEnv
 

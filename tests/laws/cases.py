@@ -91,7 +91,7 @@ VARIANTS: dict[str, list[Options]] = {
         {"memory": True, "packet": "estimate", "memory_filter": "kalman"},
     ],
     "BiasedTracking": [
-        {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"},
+        {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"}
     ],
     "LinearFusion": [
         {"fusion": rule, "measurement_matrices": [[1, 0], [[0, 1], [1, 1]], [1, -1]]}
