@@ -221,13 +221,23 @@ class FunctionalEnv:
         return self._runs(self._task(params), state).signals()
 
     def requests(self, action: Any) -> Any:
-        """Return the requests (sensors, 1) bool of an action of :meth:`action_space`."""
+        """Return the requests (sensors, 1) bool of an action.
+
+        Args:
+            action: Action of :meth:`action_space`.
+
+        Raises:
+            ValueError: The action has another shape.
+        """
+        action, shape = jnp.asarray(action), self._view.actions.shape
+        if action.shape != shape:
+            raise ValueError(f"action of shape {action.shape} is not allowed: it must be {shape}")
         if isinstance(self._view.actions, spaces.MultiBinary):
-            return jnp.asarray(action).reshape(-1, 1).astype(np.bool_)
+            return action.reshape(-1, 1).astype(np.bool_)
         sensors = jnp.arange(self.task.sensors)[:, None]
         if self.task.access == "single":
             return action == sensors + 1
-        return (jnp.asarray(action) >> sensors & 1).astype(np.bool_)
+        return (action >> sensors & 1).astype(np.bool_)
 
     def _normals(self, key: Any) -> Any:
         channels = self.task.system.noise_channels + (self.task.access == "random")

@@ -61,15 +61,27 @@ def test_an_episode_that_ends_is_reset() -> None:
     _, state = env.reset(key, params)
     for number in range(1, 7):
         key, own = jax.random.split(key)
-        observation, state, _, terminated, truncated, info = env.step(own, state, [1, 0], params)
+        observation, state, _, terminated, truncated, info = env.step(
+            own, state, np.array([1, 0]), params
+        )
         assert (bool(terminated), bool(truncated)) == (False, number % 3 == 0)
         assert int(state.steps[0]) == number % 3
         same = np.array_equal(observation, info["final_observation"])
         assert same == (number % 3 != 0)
     env, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", horizon=1, clock=True)
-    *_, terminated, truncated, _ = env.step(key, env.reset(key, params)[1], [1, 0], params)
+    *_, terminated, truncated, _ = env.step(
+        key, env.reset(key, params)[1], np.array([1, 0]), params
+    )
     assert bool(terminated)
     assert not bool(truncated)
+
+
+def test_an_action_of_another_shape_is_refused() -> None:
+    for options, action in (({}, [1, 0, 1]), ({"access": "single"}, [1, 0])):
+        env, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", **options)
+        _, state = env.reset(jax.random.key(0), params)
+        with pytest.raises(ValueError, match=r"^action of shape .* is not allowed"):
+            env.step(jax.random.key(1), state, np.array(action), params)
 
 
 def test_parameters_may_be_mapped() -> None:
@@ -79,7 +91,7 @@ def test_parameters_may_be_mapped() -> None:
     def reward(variance: Any) -> Any:
         changed = params._replace(measurement_variance=variance)
         _, state = env.reset(key, changed)
-        return env.step(key, state, [1, 1, 1], changed)[2]
+        return env.step(key, state, np.ones(3), changed)[2]
 
     variances = np.stack([factor * params.measurement_variance for factor in (0.5, 1.0, 2.0)])
     together = jax.vmap(reward)(variances)
@@ -87,7 +99,7 @@ def test_parameters_may_be_mapped() -> None:
     assert len(set(together.tolist())) == 3
     dear = params._replace(price=100.0)
     _, state = env.reset(key, dear)
-    info = env.step(key, state, [1, 1, 1], dear)[-1]
+    info = env.step(key, state, np.ones(3), dear)[-1]
     assert float(info["reward_cost"]) == -100.0 * float(info["cost"]) < 0.0
 
 
