@@ -3,10 +3,10 @@
     python -m benchmarks.plain_ppo [SETTING …] [--output runs/plain_ppo] [--resume]
 
 The settings are the registered environments with their defaults, and the Tobit oscillator of
-``agents/benchmark/settings.yaml``. No parameter is tuned to a setting. Rewards are normalised, and their
-error is the mismatch. Rules and agents have no memory and run the same episodes. An agent's share
-is 0 at the return of the best simple rule, which uses only the clock or random numbers, and 1 at
-the return of the best rule of the environment's sweep. A training and the rules of a setting are
+``agents/benchmark/settings.yaml``. No parameter is tuned to a setting. Rewards are normalised, and
+their error is the mismatch. Rules and agents have no memory and run the same episodes. An agent's
+share is 0 at the return of the best simple rule, which uses only the clock or random numbers, and 1
+at the return of the best rule of the environment's sweep. A training and the rules of a setting are
 pieces with a file each: ``--resume`` skips finished ones.
 
 In the biased oscillator the error diverges in about one episode of a thousand: a share there has a
