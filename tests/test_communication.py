@@ -1,4 +1,4 @@
-"""What a packet holds, who hears what: the estimates against Kalman's, and what is refused."""
+"""What a packet holds, who receives what: the estimates against Kalman's, and what is refused."""
 
 from typing import Any
 

@@ -48,7 +48,7 @@ ENVIRONMENTS: dict[str, tuple[str, Values]] = {
         {"sensors": 2, "cost_weight": 0.3, "access": "single", "noise_deviation": (1.0, 1.5)},
     ),
 }
-# What a sensor remembers and hears, and what a scheduler does.
+# The memory of a sensor, what it receives, and the same of a scheduler.
 REMEMBERING: dict[str, tuple[str, Values]] = {
     "tobit, memory": ("TobitOscillator-v1", {"filter": "tobit", "memory": True}),
     "biased, memory, estimates": ("BiasedTracking-v1", {"memory": True, "packet": "estimate"}),
