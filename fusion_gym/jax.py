@@ -179,7 +179,7 @@ class FunctionalEnv:
             params: Parameters, by default of the options.
         """
         task, steps = self._task(params), cast(Any, jnp.zeros(1, dtype=np.int64))
-        price = task.reward.price.draw(uniform)
+        price: Any = task.reward.price.draw(uniform)
         if params is not None and params.price is not None:
             price = jnp.full(1, params.price)
         system, noise = task.system, jnp.asarray(noise)
