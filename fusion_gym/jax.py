@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -26,19 +27,15 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.errors import refusal
-from fusion_gym.fusion.rules import InformationFusion
 from fusion_gym.importing import require
-from fusion_gym.systems.remote.system import RemoteEstimationState, RemoteEstimationSystem
-from fusion_gym.systems.tobit.system import CensoredState, CensoredSystem
+from fusion_gym.systems.tobit.system import CensoredSystem
 
 require("an environment under JAX", "jax", "jax")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
+from jax.custom_batching import custom_vmap  # noqa: E402
 
-jax.config.update("jax_enable_x64", True)
-for _kind in (CensoredState, RemoteEstimationState):
-    _names = [field.name for field in dataclasses.fields(_kind)]
-    jax.tree_util.register_dataclass(_kind, _names, [])
+from fusion_gym.core.compiled import register_state  # noqa: E402
 
 
 class EnvParams(NamedTuple):
@@ -86,10 +83,12 @@ class FunctionalEnv:
     """
 
     def __init__(self, task: Task) -> None:
-        self.task, system = task, task.system
-        refuse(task)
+        self.task = task = dataclasses.replace(task, backend="jax")
+        system = task.system
+        register_state(system.start(np.zeros((system.start_channels, 1))))
         self._memory, self._layout = Memory(task, "scheduler"), ObservationLayout(task)
         self._view = SchedulerView(task)
+        self._channels = system.noise_channels + (task.access == "random")
         price = task.reward.price.fixed
         self.default_params = EnvParams(price)
         if isinstance(system, CensoredSystem):
@@ -128,10 +127,7 @@ class FunctionalEnv:
             key: Key of ``jax.random``.
             params: Parameters, by default of the options.
         """
-        start, first, price = jax.random.split(key, 3)
-        noise = jax.random.normal(start, (self.task.system.start_channels, 1))
-        uniform = jax.random.uniform(price, (1,))
-        return self.reset_env(noise, self._normals(first), uniform, params)
+        return _for_one_run(self._begin)(params, key, ())
 
     @functools.partial(jax.jit, static_argnums=0)
     def step(
@@ -148,24 +144,48 @@ class FunctionalEnv:
             action: Action of :meth:`action_space`.
             params: Parameters, by default of the options.
         """
-        noise, again = jax.random.split(key)
-        last, moved, outcome = self.step_env(self._normals(noise), state, action, params)
-        observation, fresh = self.reset(again, params)
-        ended = outcome.ended[0]
-        terminated = ended & self.task.clock
+        requests = self.requests(action)[:, 0]
+        observation, state, results = _for_one_run(self._move)(params, (key, requests), state)
+        return observation, state, *results
+
+    def _begin(self, params: EnvParams | None, keys: Any, _: tuple[()]) -> tuple[Any, Position]:
+        """Return observations (N, entries) and state of N runs from their keys."""
+        noise, price = jax.vmap(jax.random.split, out_axes=1)(keys)
+        channels = self.task.system.start_channels
+        noise = _normals(noise, channels + self._channels)
+        uniform = jax.vmap(jax.random.uniform)(price)
+        start, first = noise[:channels], noise[channels:]
+        return self._started(start, first, uniform, params)
+
+    def _move(
+        self, params: EnvParams | None, inputs: tuple[Any, Any], state: Position
+    ) -> tuple[Any, Position, tuple[Any, ...]]:
+        """Return observations, state and results of N runs from keys and requests (N, sensors)."""
+        keys, requests = inputs
+        noise, again = jax.vmap(jax.random.split, out_axes=1)(keys)
+        task = self._task(params)
+        runs = self._runs(task, state)
+        outcome = runs.step(requests.T, _normals(noise, self._channels))
+        last, moved, ended = runs.observe(), runs.position(), outcome.ended
+
+        def renew(moved: Position) -> Position:
+            fresh = self._begin(params, again, ())[1]
+            return jax.tree.map(functools.partial(jnp.where, ended), fresh, moved)
+
+        moved = jax.lax.cond(ended.any(), renew, lambda moved: moved, moved)
+        terminated = ended & task.clock
         info = {
-            "cost": outcome.cost[0],
-            "reward_error": outcome.reward_error[0],
-            "reward_cost": outcome.reward_communication[0],
-            "granted": outcome.granted[:, 0],
-            "denied": (outcome.requested & ~outcome.granted)[:, 0],
-            "squared_error": outcome.squared_error[:, 0],
-            "diverged": outcome.diverged[0],
+            "cost": outcome.cost,
+            "reward_error": outcome.reward_error,
+            "reward_cost": outcome.reward_communication,
+            "granted": outcome.granted.T,
+            "denied": (outcome.requested & ~outcome.granted).T,
+            "squared_error": outcome.squared_error.T,
+            "diverged": outcome.diverged,
             "final_observation": last,
         }
-        observation = jnp.where(ended, observation, last)
-        state = jax.tree.map(functools.partial(jnp.where, ended), fresh, moved)
-        return observation, state, outcome.reward[0], terminated, ended & ~terminated, info
+        results = outcome.reward, terminated, ended & ~terminated, info
+        return self._runs(task, moved).observe(), moved, results
 
     def reset_env(
         self, start: Any, noise: Any, uniform: Any, params: EnvParams | None = None
@@ -178,23 +198,8 @@ class FunctionalEnv:
             uniform: Number (1,) in [0, 1) that draws a random price.
             params: Parameters, by default of the options.
         """
-        task, steps = self._task(params), cast(Any, jnp.zeros(1, dtype=np.int64))
-        price: Any = task.reward.price.draw(uniform)
-        if params is not None and params.price is not None:
-            price = jnp.full(1, params.price)
-        system, noise = task.system, jnp.asarray(noise)
-        first = system.start(cast(Any, jnp.asarray(start)))
-        position = Position(
-            system.sense(first, noise[: system.noise_channels]),
-            task.bucket.start(1),
-            price,
-            steps,
-            steps + task.horizon,
-            task.bucket.start_queue(1),
-            self._admitted(steps, noise),
-        )
-        position = jax.tree.map(jnp.asarray, position)
-        return self._runs(task, position).observe()[0], position
+        observation, state = self._started(start, noise, uniform, params)
+        return observation[0], state
 
     def step_env(
         self, noise: Any, state: Position, action: Any, params: EnvParams | None = None
@@ -210,6 +215,36 @@ class FunctionalEnv:
         runs = self._runs(self._task(params), state)
         outcome = runs.step(self.requests(action), cast(Any, jnp.asarray(noise)))
         return runs.observe()[0], runs.position(), outcome
+
+    def expected_step(
+        self, noise: Any, state: Position, probability: Any, params: EnvParams | None = None
+    ) -> tuple[Position, Outcome]:
+        """Return state and outcome of a step, averaged over random requests.
+
+        The result is a smooth function of the probabilities, for a trigger that is learned by its
+        gradient. Whole numbers, such as places in the queue, come from a step without requests.
+
+        Args:
+            noise: Standard normals (channels, 1).
+            state: State of the run.
+            probability: Probability (sensors,) of each sensor's request, independent of the others.
+            params: Parameters, by default of the options.
+        """
+        count = self.task.sensors
+        requests = (np.arange(2**count)[:, None] >> np.arange(count) & 1).astype(np.bool_)
+        weights = jnp.where(requests, probability, 1.0 - jnp.asarray(probability)).prod(1)
+        task = self._task(params)
+
+        def step(own: Any) -> tuple[Position, Outcome]:
+            branch = self._runs(task, state)
+            outcome = branch.step(own[:, None], cast(Any, jnp.asarray(noise)))
+            return branch.position(), outcome
+
+        def average(values: Any) -> Any:
+            whole = not jnp.issubdtype(values.dtype, jnp.floating)
+            return values[0] if whole else jnp.tensordot(weights, values, 1)
+
+        return jax.tree.map(average, jax.vmap(step)(jnp.asarray(requests)))
 
     def signals(self, state: Position, params: EnvParams | None = None) -> Signals:
         """Return the signals of a state, for ``innovation_threshold`` and other rules.
@@ -239,12 +274,27 @@ class FunctionalEnv:
             return action == sensors + 1
         return (action >> sensors & 1).astype(np.bool_)
 
-    def _normals(self, key: Any) -> Any:
-        channels = self.task.system.noise_channels + (self.task.access == "random")
-        return jax.random.normal(key, (channels, 1))
-
-    def _admitted(self, steps: Any, noise: Any) -> Any:
-        return access_mask(self.task.access, self.task.sensors, steps, noise[-1])
+    def _started(
+        self, start: Any, noise: Any, uniform: Any, params: EnvParams | None
+    ) -> tuple[Any, Position]:
+        task, system = self._task(params), self.task.system
+        start, noise = jnp.asarray(start), jnp.asarray(noise)
+        steps = cast(Any, jnp.zeros(noise.shape[1], dtype=np.int64))
+        price: Any = task.reward.price.draw(uniform)
+        if params is not None and params.price is not None:
+            price = params.price
+        admitted = access_mask(self.task.access, self.task.sensors, steps, noise[-1])
+        position = Position(
+            task.system.sense(task.system.start(start), noise[: system.noise_channels]),
+            task.bucket.start(noise.shape[1]),
+            cast(Any, jnp.broadcast_to(price, steps.shape)),
+            steps,
+            steps + task.horizon,
+            task.bucket.start_queue(noise.shape[1]),
+            admitted,
+        )
+        position = jax.tree.map(jnp.asarray, position)
+        return self._runs(task, position).observe(), position
 
     def _runs(self, task: Task, position: Position) -> Branch:
         return Branch(task, self._memory, self._layout, position)
@@ -259,6 +309,45 @@ class FunctionalEnv:
         if not isinstance(self.task.system, CensoredSystem):
             raise refusal("params", sorted(changed), "only price", f"in {self.name}")
         return dataclasses.replace(self.task, system=self.task.system.with_model(**changed))
+
+
+def _normals(keys: Any, channels: int) -> Any:
+    """Return standard normals (channels, N) from N keys."""
+    return jax.vmap(lambda key: jax.random.normal(key, (channels,)))(keys).T
+
+
+def _for_one_run(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of N runs as one of a single run, which ``jax.vmap`` turns back.
+
+    Without this the batch axis were the first one, and a step several times slower.
+
+    Args:
+        function: From parameters, arrays (N, …) and a state (…, N) to a tuple of arrays (N, …) and
+            a state in second place.
+    """
+
+    def single(params: Any, inputs: Any, state: Any) -> Any:
+        first, moved, *rest = function(params, jax.tree.map(lambda x: x[None], inputs), state)
+        first, rest = jax.tree.map(lambda x: x[0], (first, rest))
+        return first, moved, *rest
+
+    def several(size: int, mapped: Any, params: Any, inputs: Any, state: Any) -> Any:
+        axes = jax.tree.map(lambda own: 0 if own else None, tuple(mapped))
+        if any(jax.tree.leaves(mapped[0])):
+            result = jax.vmap(single, axes, axis_size=size)(params, inputs, state)
+        else:
+            whole = jax.vmap(lambda *values: values, axes, axis_size=size)(params, inputs, state)
+            runs = jax.tree.map(lambda x: jnp.moveaxis(x[..., 0], 0, -1), whole[2])
+            first, moved, *rest = function(params, whole[1], runs)
+            moved = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0)[..., None], moved)
+            result = first, moved, *rest
+        return result, jax.tree.map(lambda _: True, result)
+
+    mapped = custom_vmap(single)
+    mapped.def_vmap(several)
+    result = jax.custom_jvp(mapped)  # custom_vmap has no derivatives
+    result.defjvp(lambda primals, tangents: jax.jvp(single, primals, tangents))
+    return result
 
 
 class FiveValueEnv(FunctionalEnv):
@@ -293,30 +382,6 @@ class FiveValueEnv(FunctionalEnv):
         *values, terminated, truncated, info = super().step(key, state, action, params)
         info |= {"terminated": terminated, "truncated": truncated}
         return values[0], values[1], values[2], terminated | truncated, info
-
-
-def refuse(task: Task) -> None:
-    """Refuse a task that does not run under JAX.
-
-    Args:
-        task: The task.
-
-    Raises:
-        ConfigurationError: The system, its fusion rule, its memory or its error function is
-            NumPy's only.
-    """
-    system = task.system
-    if not isinstance(system, CensoredSystem | RemoteEstimationSystem):
-        raise refusal("system", type(system).__name__, "a system that JAX runs")
-    if system.nature.departing:
-        raise refusal(system.nature.departing[0], "a departure", "the default under JAX")
-    if task.memory or task.belief_features:
-        raise refusal("memory", True, "False under JAX")
-    if callable(task.reward.error):
-        raise refusal("error", task.reward.error_kind, "'squared', 'trace' or 'maximum' under JAX")
-    fusion = getattr(getattr(system, "centre", None), "fusion", None)
-    if fusion is not None and not isinstance(fusion, InformationFusion):
-        raise refusal("fusion", type(fusion).__name__, "'federated' under JAX")
 
 
 def make(env: str | CommonOptions, /, **options: Any) -> tuple[FunctionalEnv, EnvParams]:

@@ -1,7 +1,10 @@
 """Environments as pure functions of JAX: NumPy's results on the same noise, and autoresets."""
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -10,10 +13,12 @@ from test_namespace import TASKS
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
+from fusion_gym.evaluation import run_episodes
 from fusion_gym.jax import FunctionalEnv
 from fusion_gym.validation import ConfigurationError
 
 HORIZON, EPISODES = 30, 3
+TOBIT = "fusion_gym/TobitOscillator-v1"
 RULES = (
     "innovation_threshold:threshold=1.1",
     "innovation_threshold:threshold=1.1,whitened=true,at_most=1",
@@ -23,7 +28,7 @@ RULES = (
 )
 
 
-@pytest.mark.parametrize(("name", "options"), TASKS)
+@pytest.mark.parametrize(("name", "options"), dict(TASKS).items())
 def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(f"fusion_gym/{name}", **options | {"horizon": HORIZON})
     env, source, system = FunctionalEnv(task), PhiloxNoise(), task.system
@@ -53,6 +58,76 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
                     np.asarray(ours, np.float64), theirs, rtol=1e-9, atol=1e-9
                 )
         assert bool(result.ended[0])
+
+
+@pytest.mark.parametrize(("name", "options"), TASKS)
+def test_backend_equals_numpy_and_itself_in_any_batch(name: str, options: dict[str, Any]) -> None:
+    options = {"horizon": HORIZON, "vectorization_mode": "vector_entry_point"} | options
+    envs = [
+        gymnasium.make_vec(f"fusion_gym/{name}", runs, backend=backend, **options)
+        for runs, backend in ((3, "numpy"), (3, "jax"), (1, "jax"))
+    ]
+    envs[0].action_space.seed(0)
+    results: list[Any] = [
+        (env.reset(seed=seed)[0],) for env, seed in zip(envs, (7, 7, 8), strict=True)
+    ]
+    for step in range(200):
+        numpy, compiled, single = ([*jax.tree.leaves(result)] for result in results)
+        for a, b, c in zip(numpy, compiled, single, strict=True):
+            tolerance = 1e-6 if a.dtype == np.float32 else 1e-9
+            np.testing.assert_allclose(b, a, rtol=tolerance, atol=tolerance)
+            np.testing.assert_allclose(c, b[1:2], rtol=tolerance, atol=tolerance)
+        actions = envs[0].action_space.sample()
+        results = [
+            env.step(part) for env, part in zip(envs, (actions, actions, actions[1:2]), strict=True)
+        ]
+        if step % 40 == 0:  # what is computed on demand
+            batches = [env.unwrapped.batch for env in envs[:2]]
+            states = [(batch.state, batch.delivered, batch.price, batch.steps) for batch in batches]
+            for a, b in zip(*map(jax.tree.leaves, states), strict=True):
+                np.testing.assert_allclose(
+                    np.asarray(b, np.float64), np.asarray(a, np.float64), rtol=1e-9, atol=1e-9
+                )
+
+
+def test_interfaces_of_learners_and_rules_run_under_jax() -> None:
+    options: dict[str, Any] = {"filter": "tobit", "horizon": HORIZON}
+    sums = []
+    for backend in ("numpy", "jax"):
+        task = fusion_gym.make_task(TOBIT, backend=backend, **options)
+        rule = fusion_gym.make_policy("value_of_information", task)
+        total = [run_episodes(task, rule, 3, seed=0).returns]
+        envs = fusion_gym.make_sb3_vec_env(
+            TOBIT, 3, seed=0, training_error="mismatch", stagger=True, backend=backend, **options
+        )
+        envs.reset()
+        total += [envs.step(np.ones((3, 3)))[1] for _ in range(2 * HORIZON)]
+        agents = fusion_gym.parallel_env(TOBIT, backend=backend, **options)
+        agents.reset(seed=0)
+        total.append(agents.step(dict.fromkeys(agents.agents, 1))[1]["sensor_0"])
+        sums.append(np.hstack(total))
+    np.testing.assert_allclose(*sums, rtol=1e-9)
+
+
+def test_runs_together_are_the_runs_alone() -> None:
+    env, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", horizon=4)
+    keys = jax.random.split(jax.random.key(0), 3)
+    alone = [env.reset(key, params) for key in keys]
+    observation, together = jax.vmap(env.reset, (0, None))(keys, params)
+    for step in range(6):
+        for run, (seen, state) in enumerate(alone):
+            own = jax.tree.map(lambda x, run=run: x[run], (observation, together))
+            jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), (seen, state), own)
+        if step == 2:  # another episode's end
+            alone[1] = alone[1][0], alone[1][1]._replace(limit=np.array([3]))
+            together = together._replace(limit=np.array([[4], [3], [4]]))
+        action = np.arange(6).reshape(3, 2) % 2
+        alone = [
+            env.step(k, s, a, params)[:2] for k, (_, s), a in zip(keys, alone, action, strict=True)
+        ]
+        observation, together, *_ = jax.vmap(env.step, (0, 0, 0, None))(
+            keys, together, action, params
+        )
 
 
 def test_an_episode_that_ends_is_reset() -> None:
@@ -97,6 +172,16 @@ def test_parameters_may_be_mapped() -> None:
     together = jax.vmap(reward)(variances)
     np.testing.assert_allclose(together, [reward(v) for v in variances], rtol=1e-12)
     assert len(set(together.tolist())) == 3
+    rule = fusion_gym.make_policy("innovation_threshold", env.task)
+    state, thresholds = env.reset(key, params)[1], np.linspace(0.0, 2.0, 9)
+    requests = jax.vmap(lambda x: replace(rule, threshold=x)(env.signals(state)))(thresholds)
+    each = [replace(rule, threshold=x)(env.signals(state)) for x in thresholds.tolist()]
+    np.testing.assert_array_equal(requests, each)
+    certain = env.expected_step(np.ones((7, 1)), state, np.array([1.0, 0.0, 1.0]), params)
+    _, *step = env.step_env(np.ones((7, 1)), state, np.array([1, 0, 1]), params)
+    for ours, theirs in zip(jax.tree.leaves(certain), jax.tree.leaves(step), strict=True):
+        if ours.dtype == np.float64:
+            np.testing.assert_allclose(ours, theirs, rtol=1e-12)
     dear = params._replace(price=100.0)
     _, state = env.reset(key, dear)
     info = env.step(key, state, np.ones(3), dear)[-1]
@@ -117,3 +202,5 @@ def test_what_jax_does_not_run_is_refused(name: str, options: dict[str, Any], fi
     options = {"error": lambda error, _: (error**2).sum(0)} if field == "error" else options
     with pytest.raises(ConfigurationError, match=rf"^{field} = .* is not allowed"):
         fusion_gym.jax.make(f"fusion_gym/{name}", **options)
+    with pytest.raises(ConfigurationError, match=rf"^{field} = .* is not allowed under JAX"):
+        gymnasium.make(f"fusion_gym/{name}", backend="jax", **options)

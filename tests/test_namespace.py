@@ -12,6 +12,7 @@ import pytest
 import fusion_gym.jax
 from fusion_gym import gaussian, linalg, namespace
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.jax import FunctionalEnv
 
 PACKAGE = Path(namespace.__file__).parent
 # Modules whose functions take JAX's arrays.
@@ -131,6 +132,7 @@ DERIVATIVES = [
     (TASKS[1], "measurement_variance"),
     (TASKS[1], "information_shares"),
     (TASKS[8], "process_covariance"),
+    (TASKS[8], "threshold"),
 ]
 
 
@@ -141,7 +143,7 @@ def test_derivatives_equal_central_differences(
     """The mean squared error over 100 steps, on fixed requests and noise."""
     name, options = task_options
     task, rng = fusion_gym.make_task(f"fusion_gym/{name}", **options), np.random.default_rng(0)
-    system, steps = task.system, 100
+    env, system, steps = FunctionalEnv(task), task.system, 100
     branch = EpisodeBatch.seeded(task, 1, 0).branch()
     requests = rng.random((steps, task.sensors, 1)) < 0.4
     noise = rng.normal(size=(steps, system.noise_channels, 1))
@@ -150,13 +152,28 @@ def test_derivatives_equal_central_differences(
         "process_covariance": system.model.process_covariance[..., 0],
         "measurement_variance": sensors.variance[..., 0],
         "information_shares": np.full(sensors.count, 1.0 / sensors.count),
+        "threshold": np.full(sensors.count, 1.0),
     }[parameter]
     direction = rng.normal(size=start.shape)
     direction = (direction + direction.T) * 0.01 if parameter == "process_covariance" else direction
     if parameter == "information_shares":
         direction = (direction - direction.mean()) / 10.0
 
+    def smooth(scale: Any) -> Any:
+        threshold = start + scale * direction
+
+        def step(state: Any, noise: Any) -> Any:
+            norm = jax.numpy.linalg.norm(env.signals(state)["innovation"], axis=1)[:, 0]
+            state, outcome = env.expected_step(
+                noise, state, jax.nn.sigmoid(5.0 * (norm - threshold))
+            )
+            return state, outcome.reward.sum()
+
+        return jax.lax.scan(step, branch.position(), noise)[1].mean()
+
     def error(scale: Any) -> Any:
+        if parameter == "threshold":
+            return smooth(scale)
         model = system.with_model(**{parameter: start + scale * direction})
 
         def step(state: Any, inputs: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -17,9 +17,13 @@ from fusion_gym.core.beliefs import Owner, arrived
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import Outcome, Runs
+from fusion_gym.core.runs import Branch, Lazy, Outcome, Runs, value_of
 from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
+from fusion_gym.errors import refusal
+
+if TYPE_CHECKING:
+    from fusion_gym.core.compiled import CompiledStep
 
 # Normals in a block, of one run and of all runs (64 MB); a block has at least one step.
 _BLOCK_OF_RUN, _BLOCK = 2**11, 2**23
@@ -65,6 +69,11 @@ class EpisodeBatch(Runs):
             reference is not None and memory.keeps_every and reference is task.memory_system
         )
         self._full_state: Any = None  # the reference's state, after sensing
+        self._program = self._compiled() if task.backend == "jax" else None
+        # State, position and observations (entries, N) after the program's last step.
+        self._computed: Lazy | None = None
+        self._rows: list[Any] = []
+        self._observed: NDArray[np.float32] | None = None
         self.tokens = task.bucket.start(num_envs)
         self.queue = task.bucket.start_queue(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))
@@ -152,20 +161,18 @@ class EpisodeBatch(Runs):
             ResetNeeded: The batch was never reset.
             DivergenceError: The error of an unfinished run is not finite.
         """
-        if self.state is None:
+        if self._state is None:
             raise ResetNeeded("call reset before the first step")
-        outcome = self.deliver(requests)
+        outcome = self.deliver(requests) if self._program is None else self._run_program(requests)
         if not math.isfinite(np.vdot(outcome.error, outcome.error)):
             mean, covariance = self.task.system.fused(self.delivered)
             values = {"covariance": covariance, "mean": mean, "truth": outcome.error}
             require_finite(values, self.finished, self.steps)
         if self.reference is not None:
             self._refer(self.reference)
-        self._row += 1
-        if self._row == len(self._block):
-            self._row = 0
-            self._draw(np.arange(self.num_envs))
-        self.sense(self.normals())
+        if self._program is None:
+            self._move()
+            self.sense(self.normals())
         if self.reference is not None and not self._shared:
             self._full_state = self.reference.sense(self._full_state, self.noise())
         self.finished = outcome.ended.copy()
@@ -173,7 +180,10 @@ class EpisodeBatch(Runs):
 
     def observe(self) -> NDArray[np.float32]:
         """Return observations (N, entries); NaN in an unfinished run is a ``DivergenceError``."""
-        observation = super().observe()
+        if self._state is self._computed and self._observed is not None:
+            observation = np.ascontiguousarray(self._observed.T)
+        else:
+            observation = super().observe()
         if not math.isfinite(np.vdot(observation, observation)):
             entry = np.isnan(observation).argmax(1)  # first NaN of each run
             values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}
@@ -190,7 +200,7 @@ class EpisodeBatch(Runs):
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state of all runs for :meth:`restore`, valid until the next step."""
-        fixed = ("task", "layout", "memory", "reference", "source")
+        fixed = ("task", "layout", "memory", "reference", "source", "_program")
         moving = {key: value for key, value in vars(self).items() if key not in fixed}
         return moving | {"memory_states": self.memory.states}
 
@@ -199,6 +209,37 @@ class EpisodeBatch(Runs):
         moving = dict(snapshot)
         self.memory = self.memory.with_states(moving.pop("memory_states"))
         vars(self).update(moving)
+
+    def _compiled(self) -> CompiledStep:
+        from fusion_gym.core.compiled import CompiledStep
+
+        if self.memory.states is not None:
+            raise refusal("backend", "jax", "'numpy' with memory or the beliefs of local sensors")
+        memory = Memory(self.task, self.memory.owner)
+        return CompiledStep(lambda position: Branch(self.task, memory, self.layout, position))
+
+    def _run_program(self, requests: NDArray[np.bool_]) -> Outcome:
+        """Make both halves of a step under JAX."""
+        program, before, system = self._program, self._state, self.task.system
+        assert program is not None
+        if before is not self._computed:
+            self._rows = program.pack(self.position())
+        self.steps = self.steps + 1
+        self._move()
+        rows, after = program(self._rows, requests, self.normals())
+        outcome, self.tokens, self.queue, self._observed = after
+        self._rows = rows
+        self._computed = self._state = Lazy(lambda: program.position(rows).state)
+        self._delivered = Lazy(lambda: system.deliver(value_of(before), outcome.granted))
+        self.memory.sense(self.noise())
+        return outcome
+
+    def _move(self) -> None:
+        """Move to the noise of the next sensing."""
+        self._row += 1
+        if self._row == len(self._block):
+            self._row = 0
+            self._draw(np.arange(self.num_envs))
 
     def _refer(self, system: System[Any]) -> None:
         """Update the reference with every measurement of this step."""

@@ -23,6 +23,7 @@ ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
 Action = Literal["binary", "discrete"]
+Backend = Literal["numpy", "jax"]
 # Options that affect the scale of the reward, besides plant and sensors.
 _SCALING = (
     "access", "tokens", "token_rate", "token_capacity", "initial_tokens", "token_cost", "sharing",
@@ -107,6 +108,9 @@ class CommonOptions:
     action: Action = "binary"
     """Action space: one bit u_m per sensor (``"binary"``), or the number Σ u_m 2^m
     (``"discrete"``)."""
+    backend: Backend = "numpy"
+    """Library that computes the steps. ``"jax"`` compiles each step, which is several times faster
+    after a few seconds. It needs the extra ``jax``."""
     reward: Literal["scalar", "vector"] = "scalar"
     """``"scalar"`` returns the sum of the reward's two terms, ``"vector"`` both terms."""
     error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"

@@ -5,6 +5,8 @@ Both halves make new arrays and change none, so runs can branch on other noise.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,6 +74,23 @@ class Position(NamedTuple):
     admitted: NDArray[np.bool_]
 
 
+class Lazy:
+    """A value that is computed on first access."""
+
+    def __init__(self, compute: Callable[[], Any]) -> None:
+        self._compute = compute
+
+    @cached_property
+    def value(self) -> Any:
+        """The value."""
+        return self._compute()
+
+
+def value_of(value: Any) -> Any:
+    """Return the value of a :class:`Lazy`, and any other value as it is."""
+    return value.value if isinstance(value, Lazy) else value
+
+
 class Runs:
     """N runs of a :class:`~fusion_gym.core.task.Task` at one time, after sensing.
 
@@ -81,15 +100,12 @@ class Runs:
         layout: Layout of the observation.
 
     Attributes:
-        state: The system's state after sensing.
-        delivered: The system's state after the last delivery, for metrics and figures.
         tokens: (N,).
         price: Price of a token (N,).
         steps: Steps taken (N,).
         queue: Place of each sensor in the queue (sensors, N).
     """
 
-    state: Any
     tokens: Array
     price: Array
     steps: NDArray[np.int64]
@@ -98,7 +114,21 @@ class Runs:
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self.task, self.memory, self.layout = task, memory, layout
-        self.delivered: Any = None
+        self._delivered: Any = None
+
+    @property
+    def state(self) -> Any:
+        """The system's state after sensing."""
+        return value_of(self._state)
+
+    @state.setter
+    def state(self, state: Any) -> None:
+        self._state = state
+
+    @property
+    def delivered(self) -> Any:
+        """The system's state after the last delivery, for metrics and figures."""
+        return value_of(self._delivered)
 
     @property
     def channels(self) -> int:
@@ -114,7 +144,7 @@ class Runs:
         error = system.truth(state) - mean
         squared_error = error * error
         reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
-        self.delivered, self.tokens, self.steps = state, tokens, self.steps + 1
+        self._delivered, self.tokens, self.steps = state, tokens, self.steps + 1
         return Outcome(
             reward=reward_error + reward_communication,
             reward_error=reward_error,
@@ -145,7 +175,7 @@ class Runs:
         """Make the second half of a step: move the plant and measure, with noise (channels, N)."""
         noise = noise[: self.task.system.noise_channels]
         self.memory.sense(noise)
-        self.state = self.task.system.sense(self.delivered, noise)
+        self.state = self.task.system.sense(self._delivered, noise)
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
         """Return independent copies of ``runs``, possibly repeated, by default of all."""

@@ -381,6 +381,11 @@ class System(ABC, Generic[StateT]):
         return getattr(type(self), capability) is not getattr(System, capability)
 
     @property
+    def numpy_only(self) -> str | None:
+        """Name of the option that needs ``backend="numpy"``, ``None`` if JAX runs the system."""
+        return "system"
+
+    @property
     @abstractmethod
     def sensor_count(self) -> int:
         """Number of sensors."""

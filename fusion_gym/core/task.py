@@ -15,7 +15,7 @@ from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.admission import admit
 from fusion_gym.core.communication import communication
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import Action, CommonOptions, Scenario, plain_options
+from fusion_gym.core.options import Action, Backend, CommonOptions, Scenario, plain_options
 from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
@@ -23,6 +23,7 @@ from fusion_gym.core.token_bucket import TokenBucket
 # Knowledge class of each information mode.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "scheduler", "centre": "centre"}
 ACTION_KINDS: tuple[str, ...] = get_args(Action)
+BACKENDS: tuple[str, ...] = get_args(Backend)
 # Additional signals that need the sensors' measurements.
 SENSORS_ONLY = (
     "model", "beliefs", "belief_difference", "transmission_value", "own_beliefs",
@@ -54,6 +55,7 @@ class Task:
         clock: Whether the observation shows the steps left, so that an episode ends by termination.
         own_number: Whether a local sensor observes its own number.
         vector_reward: Whether the environments return the two terms of the reward.
+        backend: ``"numpy"``, or ``"jax"`` for steps that JAX compiles.
         nominal_error: Mean squared errors (n,) that scale belief entries
             (:mod:`fusion_gym.core.scale`); ``None`` uses the errors without transmissions.
         settings: The user's options, for reports.
@@ -79,6 +81,7 @@ class Task:
     clock: bool = False
     own_number: bool = True
     vector_reward: bool = False
+    backend: str = "numpy"
     nominal_error: Array | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -88,6 +91,7 @@ class Task:
         validation.choice("information", self.information, INFORMATION_MODES)
         validation.choice("action", self.action, ACTION_KINDS)
         validation.choice("access", self.access, ACCESS_RULES)
+        validation.choice("backend", self.backend, BACKENDS)
         if len(self.bucket.cost) != self.system.sensor_count:
             raise validation.ConfigurationError(
                 f"token_cost for {len(self.bucket.cost)} sensors is not allowed: the system has "
@@ -104,6 +108,8 @@ class Task:
                 f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
                 f"system has {states} states, so its shape must be ({states}, 1)"
             )
+        if self.backend == "jax":
+            self._refuse_jax()
 
     @classmethod
     def create(
@@ -159,6 +165,7 @@ class Task:
             clock=options.clock,
             own_number=options.own_number,
             vector_reward=options.reward == "vector",
+            backend=options.backend,
             nominal_error=nominal_error,
             settings=plain_options(asdict(options)),
             policy_defaults=scenario.policy_defaults,
@@ -203,6 +210,19 @@ class Task:
         signals = self.system.signals
         hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
         return (*hidden, *(() if covers(self.knowledge, "scheduler") else SENSORS_ONLY))
+
+    def _refuse_jax(self) -> None:
+        """Refuse options that do not run under JAX."""
+        system, kind = self.system, type(self.system).__name__
+        fields = [system.numpy_only] if system.numpy_only else []
+        fields += [*system.nature.departing, *(["memory"] if self.memory else [])]
+        fields += ["belief_features"] if self.belief_features else []
+        fields += ["error"] if callable(self.reward.error) else []
+        if "system" in fields:
+            raise validation.refusal("system", kind, "a system that JAX runs", "under JAX")
+        if fields:
+            value = self.settings.get(fields[0])
+            raise validation.refusal(fields[0], value, "the default", "under JAX")
 
 
 def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:

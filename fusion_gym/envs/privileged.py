@@ -154,7 +154,7 @@ def reference_system(
     Raises:
         ConfigurationError: The id, an option or the filter is unknown.
     """
-    settings = {**options, "information": "sensors", "memory": True}
+    settings = {**options, "information": "sensors", "memory": True, "backend": "numpy"}
     if memory_filter is not None:
         settings["memory_filter"] = memory_filter
     task = make_task(env_id, **settings)

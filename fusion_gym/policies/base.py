@@ -113,8 +113,9 @@ class Rule:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            if check := field.metadata.get("check"):
-                check(field.name, getattr(self, field.name))
+            value = getattr(self, field.name)
+            if (check := field.metadata.get("check")) and namespace(value) is np:
+                check(field.name, value)
         self.reset(0)
 
     @property
@@ -124,7 +125,10 @@ class Rule:
 
     def column(self, name: str, sensors: int) -> Array:
         """Return a parameter as (sensors, 1), from one number for all sensors or one for each."""
-        return validation.spread(name, getattr(self, name), (sensors,))[:, None]
+        value, xp = getattr(self, name), namespace(getattr(self, name))
+        if xp is not np:
+            return xp.broadcast_to(value, (sensors,))[:, None]
+        return validation.spread(name, value, (sensors,))[:, None]
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Clear the variables of the rule; the base class has none."""

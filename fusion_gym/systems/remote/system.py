@@ -96,6 +96,11 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
     signals = SIGNALS
 
     @property
+    def numpy_only(self) -> str | None:
+        """See :class:`System`."""
+        return None
+
+    @property
     def sensor_count(self) -> int:
         """Number of sensors, one per source."""
         return len(self.coefficient)

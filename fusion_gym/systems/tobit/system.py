@@ -28,6 +28,7 @@ from fusion_gym.core.system import (
     numbered,
     sensed,
 )
+from fusion_gym.fusion.rules import InformationFusion
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, Feedback
@@ -93,6 +94,12 @@ class CensoredSystem(System[CensoredState]):
     known_start: bool = False
     signals = SIGNALS
     extensions = ("state_weights", "with_model")
+
+    @property
+    def numpy_only(self) -> str | None:
+        """See :class:`System`."""
+        fusion = getattr(self.centre, "fusion", None)
+        return None if fusion is None or isinstance(fusion, InformationFusion) else "fusion"
 
     @property
     def sensor_count(self) -> int:

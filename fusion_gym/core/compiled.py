@@ -1,0 +1,122 @@
+"""A step of N runs as one program that JAX compiles.
+
+The import switches JAX to 64 bits and to a persistent compilation cache. The cache's folder is
+JAX's ``jax_compilation_cache_dir``, by default ``~/.cache/fusion-gym/jax``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array
+from fusion_gym.importing import require
+
+if TYPE_CHECKING:
+    from fusion_gym.core.runs import Branch, Outcome, Position
+    from fusion_gym.core.token_bucket import Queue
+
+require("an environment under JAX", "jax", "jax")
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_cpu_enable_async_dispatch", False)  # threads cost more than a step
+if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+    folder = Path.home() / ".cache" / "fusion-gym" / "jax"
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+# A program whose arrays have at most 512 bytes runs in one thread, twice as fast at one run.
+_ROWS = 64
+
+
+def register_state(state: Any) -> None:
+    """Register the dataclass of a system's states with JAX."""
+    if jax.tree_util.all_leaves([state]):
+        names = [field.name for field in dataclasses.fields(state)]
+        jax.tree_util.register_dataclass(type(state), names, [])
+
+
+class Result(NamedTuple):
+    """The outcome of a step, and the tokens, queue and observations (entries, N) after it."""
+
+    outcome: Outcome
+    tokens: Array
+    queue: Queue
+    observation: NDArray[np.float32]
+
+
+class CompiledStep:
+    """A step and its observation, with one array of float64 in and two out.
+
+    JAX takes longer to pass many arrays than to compute a step of one run, so a position is one
+    array (entries, N), and NumPy's positions have views of it.
+
+    Args:
+        branch: Function that returns the runs at a position, which JAX traces.
+    """
+
+    def __init__(self, branch: Callable[[Position], Branch]) -> None:
+        self._branch, self._program = branch, jax.jit(self._trace)
+
+    def pack(self, position: Position) -> Any:
+        """Return the rows (entries, N) of a position."""
+        register_state(position.state)
+        self._position = _Rows(position)
+        return self._position.pack(np, position)
+
+    def __call__(
+        self, rows: list[Any], requests: NDArray[np.bool_], noise: Array
+    ) -> tuple[list[Any], Result]:
+        """Return the rows and the results after a step."""
+        rows, result = self._program(rows, requests, noise)
+        return rows, self._result.unpack(result)
+
+    def position(self, rows: list[Any]) -> Position:
+        """Return the position of rows."""
+        return self._position.unpack(rows)
+
+    def _trace(self, rows: Any, requests: Any, noise: Any) -> tuple[list[Any], list[Any]]:
+        runs = self._branch(self._position.unpack(rows))
+        outcome = runs.step(requests, noise)
+        result = Result(outcome, runs.tokens, runs.queue, runs.observe().T)
+        self._result = _Rows(result)
+        return self._position.pack(jnp, runs.position()), self._result.pack(jnp, result)
+
+
+class _Rows:
+    """The shapes and types of a tree of arrays (…, N), and its form as few arrays (rows, N)."""
+
+    def __init__(self, tree: Any) -> None:
+        leaves, self._tree = jax.tree.flatten(tree)
+        self._leaves: list[tuple[int, slice, tuple[int, ...], Any]] = []
+        array = end = 0
+        for leaf in leaves:
+            rows = math.prod(leaf.shape[:-1])
+            if end + rows > _ROWS:
+                array, end = array + 1, 0
+            self._leaves.append((array, slice(end, end + rows), leaf.shape[:-1], leaf.dtype))
+            end += rows
+
+    def pack(self, xp: Any, tree: Any) -> list[Any]:
+        arrays: list[list[Any]] = [[] for _ in range(self._leaves[-1][0] + 1)]
+        for (array, *_), leaf in zip(self._leaves, jax.tree.leaves(tree), strict=True):
+            arrays[array].append(leaf.reshape(-1, leaf.shape[-1]))
+        return [xp.concatenate(rows, dtype=np.float64) for rows in arrays]
+
+    def unpack(self, arrays: list[Any]) -> Any:
+        runs = arrays[0].shape[-1]
+        if isinstance(arrays[0], jax.Array) and not isinstance(arrays[0], jax.core.Tracer):
+            arrays = [np.asarray(array) for array in arrays]
+        leaves = []
+        for array, rows, shape, kind in self._leaves:
+            leaf = arrays[array][rows].reshape(*shape, runs)
+            leaves.append(leaf if kind == np.float64 else leaf.astype(kind))
+        return jax.tree.unflatten(self._tree, leaves)
