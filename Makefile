@@ -11,7 +11,7 @@ QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_envir
 	tests/test_benchmark.py::test_from_prices_to_pages_and_zoo
 
 .PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers zoo newcomer docs integrations \
-	integrations-tianshou integrations-rllib lines lint format bench clean
+	integrations-tianshou integrations-rejax integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 23
@@ -82,7 +82,7 @@ films: $(STAMP)  ## the films of docs/films
 	$(WATCH)/LinearFusion-v2 --policy value_of_information --save docs/films/linear_fusion.gif
 
 # Libraries beside this one: each folder of integrations/ has pins and a virtual environment of its own,
-# .venv-light, .venv-tianshou, .venv-rllib.
+# .venv-light, .venv-tianshou, .venv-rejax, .venv-rllib.
 .venv-%/.installed: integrations/%/requirements.txt integrations/%/constraints.txt pyproject.toml
 	$(PYTHON) -m venv --clear .venv-$*
 	.venv-$*/bin/python -m pip install --disable-pip-version-check --quiet --no-compile \
@@ -99,6 +99,9 @@ integrations: .venv-light/.installed  ## other libraries: SB3, rl-zoo3, TorchRL,
 
 integrations-tianshou: .venv-tianshou/.installed  ## Tianshou
 	.venv-tianshou/bin/python -m pytest integrations/tianshou
+
+integrations-rejax: .venv-rejax/.installed  ## rejax
+	.venv-rejax/bin/python -m pytest integrations/rejax
 
 integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
@@ -141,4 +144,4 @@ bench: $(STAMP)  ## steps per second beside the alternatives, as ratios of one r
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.throughput
 
 clean:  ## remove the virtual environment and caches (not runs/)
-	rm -rf $(VENV) $(LOWEST) .venv-light .venv-tianshou .venv-rllib site build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) $(LOWEST) .venv-light .venv-tianshou .venv-rejax .venv-rllib site build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

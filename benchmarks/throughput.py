@@ -1,104 +1,153 @@
-"""Environment steps per second, everything included, beside the alternatives.
+"""Environment steps per second on one processor, everything included, beside the alternatives.
 
-    python -m benchmarks.throughput [--seconds 3]
+    python -m benchmarks.throughput [--seconds 0.3] [--page]
 
-One thread (``make bench`` sets it), float64. All rows are measured in one run, in turns, and each
-figure is the median of its turns; the ratios are to a plain loop with FilterPy and to SB3's
-DummyVecEnv. The absolute figures belong to the machine, the ratios to the code.
+All cells are measured in one run, in turns, and each is the median of its turns. The last column is
+the ratio to ``oscillator.c``, where a C compiler is at hand. ``--page`` writes the table into
+docs/speed.md.
 """
 
 import argparse
+import os
+import shutil
 import statistics
+import subprocess
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import filterpy.kalman
 import gymnasium
+import jax
 import numpy as np
 from rich.console import Console
+from rich.markdown import Markdown
+from rich.progress import track
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import fusion_gym
-from fusion_gym.output import tables
+import fusion_gym.jax
+from benchmarks.newcomer import replaced
+from fusion_gym.docstrings import table
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
-ENV = "fusion_gym/TobitOscillator-v1"
-TURNS = 5
+PAGE = Path(__file__).parent.parent / "docs" / "speed.md"
+LOOP = Path(__file__).with_name("oscillator.c")
+TURNS, RUNS = 5, (1, 64, 1024, 4096)
+RULE = "innovation_threshold:threshold=1.1"
+OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("TobitOscillator-v1", {}),
+    ("TobitOscillator-v1", {"filter": "tobit"}),
+    ("BiasedOscillator-v1", {"access": "any"}),
+    ("BiasedTracking-v1", {"access": "any"}),
+    ("LinearFusion-v2", {}),
+    ("RemoteEstimation-v1", {}),
+)
+NUMPY_ONLY: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("CorrelatedTracking-v1", {}),
+    ("CorrelatedTracking-v1", {"fusion": "ci"}),
+    ("MarkovJumpTracking-v1", {}),
+    ("UnknownInput-v1", {}),
+    ("UnknownInput-v1", {"filter": "predict"}),
+    ("UnknownInput-v1", {"filter": "paper"}),
+    ("BiasedOscillator-v1", {"filter": "adf"}),
+)
 # A workload takes seconds and returns environment steps per second.
 Workload = Callable[[float], float]
 
 
-def _timed(step: Callable[[], object], steps_per_call: int) -> Workload:
+def timed(step: Callable[[], object], steps_per_call: int) -> Workload:
+    """Return the workload of a function that makes some steps."""
+
     def run(seconds: float) -> float:
-        calls, began = 0, time.perf_counter()
-        while True:
-            for _ in range(8):
-                step()
-            calls += 8
-            elapsed = time.perf_counter() - began
-            if elapsed >= seconds:
-                return calls * steps_per_call / elapsed
+        calls, began = 0, time.process_time()
+        while (elapsed := time.process_time() - began) < seconds:
+            step()
+            calls += 1
+        return calls * steps_per_call / elapsed
 
     return run
 
 
-def single(options: dict[str, Any]) -> Workload:
-    """``gym.make``, with the reset at the end of each episode."""
-    env = gymnasium.make(ENV, **options)
-    env.reset(seed=0)
-    actions = [np.array(bits, dtype=np.int8) for bits in ((1, 0, 1), (0, 1, 0), (0, 0, 0))]
-    count = iter(range(10**12))
+def interface(env_id: str, options: dict[str, Any], runs: int, backend: str) -> Workload:
+    """``gym.make`` for one run, else ``gym.make_vec``, with the reset of ended episodes."""
+    if backend == "jax":
+        options = options | {"backend": "jax"}
+    if runs > 1:
+        mode: Any = "vector_entry_point"
+        envs = gymnasium.make_vec(env_id, runs, vectorization_mode=mode, **options)
+        return _workload(envs, runs, envs.step)
+    env = gymnasium.make(env_id, **options)
 
-    def step() -> None:
-        truncated = env.step(actions[next(count) % 3])[3]
-        if truncated:
+    def step(action: Any) -> None:
+        if env.step(action)[3]:
             env.reset()
 
-    return _timed(step, 1)
+    return _workload(env, 1, step)
 
 
-def vector(options: dict[str, Any], num_envs: int, env_id: str = ENV) -> Workload:
-    """``gym.make_vec`` with autoreset."""
-    env = gymnasium.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **options)
+def _workload(env: Any, runs: int, step: Callable[[Any], object]) -> Workload:
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(16)]
     count = iter(range(10**12))
-    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
+    return timed(lambda: step(actions[next(count) % 16]), runs)
 
 
-def native_sb3(options: dict[str, Any], num_envs: int) -> Workload:
-    """The native SB3 environment, its first episodes staggered as in training."""
-    return _sb3(fusion_gym.make_sb3_vec_env(ENV, num_envs, seed=0, stagger=True, **options))
+def noise_given(env_id: str, options: dict[str, Any], runs: int) -> Workload:
+    """The compiled step of the batch, whose noise is the same in every step."""
+    env = gymnasium.make_vec(
+        env_id, runs, vectorization_mode="vector_entry_point", backend="jax", **options
+    ).unwrapped
+    env.reset(seed=0)
+    batch: Any = env.batch  # type: ignore[attr-defined]
+    requests = np.arange(batch.task.sensors)[:, None] == np.arange(runs) % 3
+    batch.step(requests)
+    program, noise, rows = batch._program, batch.normals().copy(), [batch._rows]
+
+    def step() -> None:
+        rows[0] = program(rows[0], requests, noise)[0]
+
+    return timed(step, runs)
 
 
-def dummy_sb3(options: dict[str, Any], num_envs: int) -> Workload:
-    """SB3's DummyVecEnv over single environments."""
-    env = DummyVecEnv([lambda: gymnasium.make(ENV, **options)] * num_envs)
-    env.seed(0)
-    return _sb3(env)
+def scan(env_id: str, options: dict[str, Any], runs: int) -> Workload:
+    """100 steps of pure functions under ``jax.lax.scan``, with a rule, noise and resets."""
+    env, params = fusion_gym.jax.make(env_id, **options)
+    rule = fusion_gym.make_policy(RULE, env.task)
+
+    def one(state: Any, key: Any) -> Any:
+        action = rule(env.signals(state, params))[:, 0]
+        observation, state, reward, *_ = env.step(key, state, action, params)
+        return state, (observation.mean(), reward)
+
+    @jax.jit
+    def episodes(states: Any, key: Any) -> Any:
+        def step(states: Any, key: Any) -> Any:
+            states, results = jax.vmap(one)(states, jax.random.split(key, runs))
+            return states, [result.mean() for result in results]
+
+        return jax.lax.scan(step, states, jax.random.split(key, 100))
+
+    keys = jax.random.split(jax.random.key(0), runs)
+    states = jax.vmap(env.reset, (0, None))(keys, params)[1]
+    return timed(lambda: jax.block_until_ready(episodes(states, keys[0])), 100 * runs)
 
 
-def _sb3(env: VecEnv) -> Workload:
+def sb3(env_id: str, options: dict[str, Any], runs: int, native: bool = True) -> Workload:
+    """The native environment of Stable-Baselines3, or its DummyVecEnv over ``gym.make``."""
+    if native:
+        env: VecEnv = fusion_gym.make_sb3_vec_env(env_id, runs, seed=0, stagger=True, **options)
+    else:
+        env = DummyVecEnv([lambda: gymnasium.make(env_id, **options)] * runs)
+        env.seed(0)
     env.reset()
-    actions = np.random.default_rng(0).integers(0, 2, (16, env.num_envs, 3), dtype=np.int8)
+    actions = np.random.default_rng(0).integers(0, 2, (16, runs, *(env.action_space.shape or ())))
     count = iter(range(10**12))
-    return _timed(lambda: env.step(actions[next(count) % 16]), env.num_envs)
-
-
-# Other environments by gym.make_vec.
-OTHERS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("CorrelatedTracking", {}),
-    ("CorrelatedTracking", {"fusion": "ci"}),
-    ("MarkovJumpTracking", {}),
-    ("UnknownInput", {}),
-    ("UnknownInput", {"filter": "predict"}),
-    ("UnknownInput", {"filter": "paper"}),
-    ("BiasedOscillator", {}),
-    ("BiasedOscillator", {"filter": "adf"}),
-    ("BiasedTracking", {}),
-)
+    return timed(lambda: env.step(actions[next(count) % 16]), runs)
 
 
 def filterpy_loop() -> Workload:
@@ -123,50 +172,87 @@ def filterpy_loop() -> Workload:
             noise = 0.5**0.5 * generator.standard_normal(2)
             node.update(np.maximum(state + noise, 0.0))
 
-    return _timed(step, 1)
+    return timed(step, 1)
+
+
+def c_loop(folder: str) -> Workload | None:
+    """``oscillator.c``, or ``None`` without a C compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        return None
+    program = f"{folder}/oscillator"
+    flags = "-O3", "-march=native", "-o", program, str(LOOP), "-lm"
+    subprocess.run([compiler, *flags], check=True)
+
+    def run(seconds: float) -> float:
+        steps = str(max(1, round(3000 * seconds)))
+        printed = subprocess.run([program, "1024", steps], capture_output=True, check=True)
+        return float(printed.stdout.split()[0])
+
+    return run
+
+
+def rows(folder: str) -> Iterator[tuple[str, str, dict[int, Workload]]]:
+    """Return name, interface and the workload of each number of runs."""
+    if (loop := c_loop(folder)) is not None:
+        yield "TobitOscillator-v1", "C loop", {1024: loop}
+    yield "TobitOscillator-v1", "FilterPy loop", {1: filterpy_loop()}
+    dummy = sb3("fusion_gym/TobitOscillator-v1", {}, 64, native=False)
+    yield "TobitOscillator-v1", "SB3 `DummyVecEnv`", {64: dummy}
+    device = jax.devices()[0].platform
+    for name, options in OPTIONS:
+        env_id, label = f"fusion_gym/{name}", _label(name, options)
+        kinds: dict[str, Callable[[str, dict[str, Any], int], Workload]] = {
+            "NumPy": partial(interface, backend="numpy"),
+            f"JAX ({device})": partial(interface, backend="jax"),
+            f"JAX ({device}), noise given": noise_given,
+            f"JAX ({device}), scan": scan,
+            "SB3 `VecEnv`": sb3,
+        }
+        for kind, build in kinds.items():
+            yield label, kind, {runs: build(env_id, options, runs) for runs in RUNS}
+    for name, options in NUMPY_ONLY:
+        env_id = f"fusion_gym/{name}"
+        yield _label(name, options), "NumPy", {1024: interface(env_id, options, 1024, "numpy")}
+
+
+def _label(name: str, options: dict[str, Any]) -> str:
+    given = ", ".join(f"`{key}={value!r}`" for key, value in options.items())
+    return f"{name}, {given}" if given else name
 
 
 def main() -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(description="Environment steps per second, as ratios.")
-    parser.add_argument("--seconds", type=float, default=0.6, help="of each row and turn")
-    seconds = parser.parse_args().seconds
-    paper: dict[str, Any] = {}
-    tobit: dict[str, Any] = {"filter": "tobit"}
-    rows: dict[str, Workload] = {
-        "plain loop with FilterPy's Kalman filter": filterpy_loop(),
-        "gym.make, paper's filter": single(paper),
-        "gym.make, Tobit filter": single(tobit),
-        "SB3 DummyVecEnv, 64 × gym.make, paper's filter": dummy_sb3(paper, 64),
-        "native SB3 VecEnv, 1,024, paper's filter": native_sb3(paper, 1024),
-        "native SB3 VecEnv, 1,024, Tobit filter": native_sb3(tobit, 1024),
-        "gym.make_vec, 1,024, paper's filter": vector(paper, 1024),
-        "gym.make_vec, 1,024, Tobit filter": vector(tobit, 1024),
-    }
-    for name, options in OTHERS:
-        label = ", ".join((name, "1,024", *map(str, options.values())))
-        rows[label] = vector(options, 1024, f"fusion_gym/{name}-v1")
-    figures = measured(rows, seconds)
-    medians = {name: statistics.median(figure) for name, figure in figures.items()}
-    first, _, _, other, *_ = medians.values()
-    title = f"steps per second, one thread, median of {TURNS} turns ({ENV} where not named)"
-    heads = ("what", "steps/s", "least", "most", "to the FilterPy loop", "to DummyVecEnv")
-    cells = []
-    for name, median in medians.items():
-        speeds = (f"{speed:,.0f}" for speed in (median, min(figures[name]), max(figures[name])))
-        cells.append((name, *speeds, f"{median / first:.2f}", f"{median / other:.2f}"))
-    Console(width=130).print(tables.table_tables(title, heads, cells))
-
-
-def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]]:
-    """Steps per second of every row in every turn, after a short first try."""
-    figures: dict[str, list[float]] = {name: [] for name in rows}
-    for workload in rows.values():
-        workload(seconds / 4)
-    for _ in range(TURNS):
-        for name, workload in rows.items():
-            figures[name].append(workload(seconds))
-    return figures
+    """Measure all rows and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=0.3, help="of each cell and turn")
+    parser.add_argument("--page", action="store_true", help="write docs/speed.md")
+    arguments = parser.parse_args()
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+    with tempfile.TemporaryDirectory() as folder:
+        every = list(rows(folder))
+        workloads = [workload for *_, by_runs in every for workload in by_runs.values()]
+        figures: list[list[float]] = [[] for _ in workloads]
+        for workload in track(workloads, "first calls"):
+            workload(1e-3)
+        for turn in range(TURNS):
+            for workload, speeds in track(
+                list(zip(workloads, figures, strict=True)), f"turn {turn + 1}"
+            ):
+                speeds.append(workload(arguments.seconds))
+    medians, lines, reference = map(statistics.median, figures), [], None
+    for label, kind, by_runs in every:
+        median = {runs: next(medians) for runs in by_runs}
+        reference = median[1024] if kind == "C loop" else reference
+        cells = (f"{float(f'{median[r]:.3g}'):,.0f}" if r in median else "" for r in RUNS)
+        ratio = f"{median[1024] / reference:.2f}" if reference and 1024 in median else ""
+        lines.append((label, kind, *cells, ratio))
+    heads = "environment", "interface", "1 run", *(f"{runs:,} runs" for runs in RUNS[1:]), "1,024 to C"
+    text = f"{table(heads, lines)}\n\nMeasured in fusion-gym {fusion_gym.__version__}."
+    if arguments.page:
+        page = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replaced(page, "throughput", text), encoding="utf-8")
+    Console(width=150).print(Markdown(text))
 
 
 if __name__ == "__main__":

@@ -345,9 +345,15 @@ def _for_one_run(function: Callable[..., Any]) -> Callable[..., Any]:
 
     mapped = custom_vmap(single)
     mapped.def_vmap(several)
-    result = jax.custom_jvp(mapped)  # custom_vmap has no derivatives
-    result.defjvp(lambda primals, tangents: jax.jvp(single, primals, tangents))
-    return result
+
+    def depending(params: Any, inputs: Any, state: Any) -> Any:
+        """Make every result depend on the inputs: JAX loses the axes of constants."""
+        result = single(params, inputs, state)
+        return jax.tree.map(lambda x: jnp.where(result[0].sum() > 0.0, x, x), result)
+
+    differentiable = jax.custom_vjp(mapped)  # custom_vmap has no derivatives
+    differentiable.defvjp(lambda *values: jax.vjp(depending, *values), lambda f, g: f(g))
+    return differentiable
 
 
 class FiveValueEnv(FunctionalEnv):
@@ -371,7 +377,7 @@ class FiveValueEnv(FunctionalEnv):
     def step(  # type: ignore[override]
         self, key: Any, state: Position, action: Any, params: EnvParams | None = None
     ) -> tuple[Any, Position, Any, Any, dict[str, Any]]:
-        """Return observation, state, reward, done and info of a step.
+        """Return observation, state, reward (float32), done and info of a step.
 
         Args:
             key: Key of ``jax.random``.
@@ -381,7 +387,7 @@ class FiveValueEnv(FunctionalEnv):
         """
         *values, terminated, truncated, info = super().step(key, state, action, params)
         info |= {"terminated": terminated, "truncated": truncated}
-        return values[0], values[1], values[2], terminated | truncated, info
+        return *values[:2], values[2].astype(np.float32), terminated | truncated, info
 
 
 def make(env: str | CommonOptions, /, **options: Any) -> tuple[FunctionalEnv, EnvParams]:

@@ -100,7 +100,7 @@ class _Rows:
         array = end = 0
         for leaf in leaves:
             rows = math.prod(leaf.shape[:-1])
-            if end + rows > _ROWS:
+            if end and end + rows > _ROWS:
                 array, end = array + 1, 0
             self._leaves.append((array, slice(end, end + rows), leaf.shape[:-1], leaf.dtype))
             end += rows
