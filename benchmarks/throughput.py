@@ -247,7 +247,8 @@ def main() -> None:
         cells = (f"{float(f'{median[r]:.3g}'):,.0f}" if r in median else "" for r in RUNS)
         ratio = f"{median[1024] / reference:.2f}" if reference and 1024 in median else ""
         lines.append((label, kind, *cells, ratio))
-    heads = "environment", "interface", "1 run", *(f"{runs:,} runs" for runs in RUNS[1:]), "1,024 to C"
+    counts = (f"{runs:,} runs" for runs in RUNS[1:])
+    heads = "environment", "interface", "1 run", *counts, "1,024 to C"
     text = f"{table(heads, lines)}\n\nMeasured in fusion-gym {fusion_gym.__version__}."
     if arguments.page:
         page = PAGE.read_text(encoding="utf-8")
