@@ -170,9 +170,8 @@ def test_expected_reduction_is_the_mean_over_the_measurements() -> None:
         state.prior_mean[:, 0], state.prior_covariance[..., 0], draws
     ).T
     measurement = centre.sensors.measure(truth, generator.normal(size=(2, draws)))
-    silent, reduction = centre.variances(
-        state.prior_mean, state.prior_covariance, state.prediction, task.system.state_weights
-    )
+    prior, weights = (state.prior_mean, state.prior_covariance), task.system.state_weights
+    silent, reduction = centre.variances(prior, state.prediction, weights)
     for sensor in range(2):
         granted = np.zeros((2, draws), dtype=np.bool_)
         granted[sensor] = True

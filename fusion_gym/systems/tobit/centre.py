@@ -23,6 +23,9 @@ from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 from fusion_gym.validation import ConfigurationError
 
+Gaussian = tuple[Array, Array]  # mean (…, n, N) and covariance (…, n, n, N)
+Packets = NDArray[np.bool_]
+
 
 class CentrePrediction(NamedTuple):
     """The prediction of centre and nodes before a transmission.
@@ -61,36 +64,24 @@ class Centre(Protocol):
         ...
 
     def update(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
+    ) -> Gaussian:
         """Return mean (n, N) and covariance (n, n, N) after the grants (sensors, N)."""
         ...
 
     def local_means(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
     ) -> Array:
         """Return the nodes' means (sensors, n, N) before feedback; without nodes, the centre's."""
-        own = self.update(mean, covariance, prediction, measurement, granted)[0]
+        own = self.update(prior, prediction, measurement, granted)[0]
         return np.broadcast_to(own, (len(granted), *own.shape))
 
-    def single(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
-    ) -> tuple[Array, Array]:
+    def single(self, prior: Gaussian, prediction: CentrePrediction, measurement: Array) -> Gaussian:
         """Return means (sensors, n, N) and covariances (sensors, n, n, N) after single grants."""
         raise RuntimeError(f"{type(self).__name__} is not separable")
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
+        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """Return a silent step's weighted fused trace (N,), and its reductions (sensors, N)."""
         ...
@@ -186,38 +177,24 @@ class FeedbackCentre(NodeCentre):
         return CentrePrediction(expectation, deviation, root, outcomes)
 
     def update(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
+    ) -> Gaussian:
         """See :class:`Centre`; each node uses its planned outcome of a grant or of silence."""
         outcomes, root, share = _outcomes(prediction), prediction.root, self.feedback.share[:, None]
-        grant = granted[:, None, None]
-        own = namespace(granted).where(
-            grant, outcomes.delivered_covariance, outcomes.silent_covariance
-        )
+        both = outcomes.delivered_covariance, outcomes.silent_covariance
+        own = namespace(granted).where(granted[:, None, None], *both)
         local = self._shift(prediction, measurement, granted)
         fused = self.fusion.fuse(local, own / share[:, None], basis=root)
-        return mean + linalg.matvec(root, fused.mean), linalg.congruence(root, fused.covariance)
+        return prior[0] + linalg.matvec(root, fused.mean), linalg.congruence(root, fused.covariance)
 
     def local_means(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
     ) -> Array:
         """See :class:`Centre`."""
         local = self._shift(prediction, measurement, granted)
-        return mean + linalg.matvec(prediction.root, local)
+        return prior[0] + linalg.matvec(prediction.root, local)
 
-    def _shift(
-        self, prediction: CentrePrediction, measurement: Array, granted: NDArray[np.bool_]
-    ) -> Array:
+    def _shift(self, prediction: CentrePrediction, measurement: Array, granted: Packets) -> Array:
         """Return the nodes' means (sensors, n, N) of z."""
         outcomes = _outcomes(prediction)
         innovation = measurement - prediction.expectation.value
@@ -227,7 +204,7 @@ class FeedbackCentre(NodeCentre):
         return local / namespace(share).sqrt(share)
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
+        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; a filter that minimises a bound uses the bound."""
         outcomes, root = _outcomes(prediction), prediction.root
@@ -275,14 +252,10 @@ class FederatedCentre(NodeCentre):
         return CentrePrediction(expectation, deviation, root)
 
     def update(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
+    ) -> Gaussian:
         """See :class:`Centre`."""
+        mean, covariance = prior
         xp, places = namespace(granted), active_rows(granted)
         silent = covariance if self.filter.silence is None else linalg.gram(prediction.root)
         if not places.size:
@@ -293,37 +266,31 @@ class FederatedCentre(NodeCentre):
         return mean, xp.where(granted.any(0), posterior, silent)
 
     def local_means(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
     ) -> Array:
         """See :class:`Centre`."""
         sensors, expectation = self.sensors, prediction.expectation
         weighted = expectation.uncensored_probability[:, :, None] * sensors.measurement_matrix
-        cross = linalg.matmul(weighted, covariance)
+        cross = linalg.matmul(weighted, prior[1])
         total = linalg.matmul(cross, linalg.transpose(weighted))
         noise = sensors.variance * expectation.truncated_variance
         total = linalg.add_diagonal(total, self.feedback.share[:, None] * noise)
         innovation = measurement - expectation.value
         innovation = namespace(innovation).where(granted[:, None], innovation, 0.0)
         shift = linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
-        return mean + shift
+        return prior[0] + shift
 
-    def single(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
-    ) -> tuple[Array, Array]:
+    def single(self, prior: Gaussian, prediction: CentrePrediction, measurement: Array) -> Gaussian:
         """See :class:`Centre`."""
-        return _shifted(mean, prediction, *self._whitened(prediction, measurement, slice(None)))
+        whitened = self._whitened(prediction, measurement, slice(None))
+        return _shifted(prior[0], prediction, *whitened)
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
+        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
         silent = linalg.weighted_trace(linalg.gram(prediction.root), weights)
-        single = self.single(mean, covariance, prediction, prediction.expectation.value)[1]
+        single = self.single(prior, prediction, prediction.expectation.value)[1]
         return silent, silent - linalg.weighted_trace(single, weights)
 
     def _whitened(
@@ -362,24 +329,20 @@ class SequentialCentre(Centre):
         return CentrePrediction(expectation, deviation, root)
 
     def update(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
+    ) -> Gaussian:
         """See :class:`Centre`."""
+        mean, covariance = prior
         mean, root = self.filter.update(mean, prediction.root, measurement, granted)
         fused = namespace(granted).where(granted.any(0), linalg.gram(root), covariance)
         return mean, fused
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
+        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; the reduction is the expected one."""
-        silent = linalg.weighted_trace(covariance, weights)
-        expected = self.filter.expected_covariance(mean, prediction.root)
+        silent = linalg.weighted_trace(prior[1], weights)
+        expected = self.filter.expected_covariance(prior[0], prediction.root)
         return silent, silent - linalg.weighted_trace(expected, weights)
 
 

@@ -3,12 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.namespace import active_rows, namespace
-from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, FederatedCentre, Feedback
+from fusion_gym.systems.tobit.centre import (
+    Centre,
+    CentrePrediction,
+    FederatedCentre,
+    Feedback,
+    Gaussian,
+    Packets,
+)
 from fusion_gym.systems.tobit.filters import KalmanFilter, joint_update
 from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -45,14 +51,10 @@ class JointCentre(FederatedCentre):
     """
 
     def update(
-        self,
-        mean: Array,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        granted: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
+        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
+    ) -> Gaussian:
         """See :class:`Centre`."""
+        mean, covariance = prior
         xp, sensors, runs = namespace(granted), self.sensors, granted.shape[-1]
         every = xp.repeat(granted, sensors.size, axis=0)
         channels = active_rows(every)

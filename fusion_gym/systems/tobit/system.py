@@ -291,7 +291,7 @@ class CensoredSystem(System[CensoredState]):
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
         prior, prediction = (state.prior_mean, state.prior_covariance), sensed(state.prediction)
-        mean, covariance = self.centre.update(*prior, prediction, state.measurement, granted)
+        mean, covariance = self.centre.update(prior, prediction, state.measurement, granted)
         xp = namespace(granted)
         held = xp.where(granted[:, None], state.measurement, state.held)
         age = xp.where(granted, 0.0, state.age)
@@ -299,9 +299,8 @@ class CensoredSystem(System[CensoredState]):
 
     def single_deliveries(self, state: CensoredState) -> tuple[Array, Array]:
         """See :class:`System`."""
-        return self.centre.single(
-            state.prior_mean, state.prior_covariance, sensed(state.prediction), state.measurement
-        )
+        prior = state.prior_mean, state.prior_covariance
+        return self.centre.single(prior, sensed(state.prediction), state.measurement)
 
     def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """Return the signals of ``SIGNALS``."""
@@ -310,7 +309,7 @@ class CensoredSystem(System[CensoredState]):
         @functools.cache
         def variances() -> tuple[Array, Array]:
             prior = state.prior_mean, state.prior_covariance
-            return self.centre.variances(*prior, sensed(state.prediction), self.state_weights)
+            return self.centre.variances(prior, sensed(state.prediction), self.state_weights)
 
         return {
             "measurement": state.measurement,
@@ -364,7 +363,7 @@ class CensoredSystem(System[CensoredState]):
         if state.prediction is None:
             return np.broadcast_to(state.mean, (len(state.age), *state.mean.shape))
         prior, granted = (state.prior_mean, state.prior_covariance), state.age == 0.0
-        return self.centre.local_means(*prior, state.prediction, state.measurement, granted)
+        return self.centre.local_means(prior, state.prediction, state.measurement, granted)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) of predictions over t = 1..horizon."""
