@@ -94,7 +94,7 @@ def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = 
         before, tokens = batch.state, batch.tokens
         outcome = batch.step(requests)
         state, granted = batch.delivered, outcome.granted
-        expected, _, root, planned = state.prediction
+        expected, _, root, planned = state.prediction[:4]
         local = system.local_means(state)
         bound = np.full((*local.shape[:2], *state.covariance.shape[1:]), np.nan)
         if planned is not None:

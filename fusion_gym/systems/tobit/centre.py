@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.rules import FusionRule
+from fusion_gym.fusion.rules import FusionRule, InformationFusion
 from fusion_gym.namespace import active_rows, namespace
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.filters import (
     Expectation,
     KalmanFilter,
@@ -32,13 +33,16 @@ class CentrePrediction(NamedTuple):
 
     ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
     (n, n, N) of the covariance without a transmission, and, where nodes have covariances of their
-    own, their ``outcomes`` z of x = x̂ + G z.
+    own, their ``outcomes`` z of x = x̂ + G z. A centre that holds values has them as ``held``, and
+    their ``moment``.
     """
 
     expectation: Expectation
     deviation: Array
     root: Array
     outcomes: Outcomes | None = None
+    held: Any = None
+    moment: Any = None
 
 
 class Centre(Protocol):
@@ -58,6 +62,16 @@ class Centre(Protocol):
     def separable(self) -> bool:
         """Whether :meth:`single` is available, and faster than one update after another."""
         return False
+
+    @property
+    def numpy_only(self) -> str | None:
+        """Name of the option that needs ``backend="numpy"``, or ``None``."""
+        return None
+
+    def advance(self, model: LinearPlant, state: Any) -> tuple[Gaussian, CentrePrediction]:
+        """Return the prior and the prediction one step after a state's delivery."""
+        prior = model.predict(state.mean, state.covariance)
+        return prior, self.predict(*prior, state.held, state.time + 1.0)
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """Return the expectations under the centre's prediction (n, N), (n, n, N)."""
@@ -164,6 +178,11 @@ class FeedbackCentre(NodeCentre):
     """
 
     fusion: FusionRule
+
+    @property
+    def numpy_only(self) -> str | None:
+        """See :class:`Centre`."""
+        return None if isinstance(self.fusion, InformationFusion) else "fusion"
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`."""

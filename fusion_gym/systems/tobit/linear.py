@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, plain_options
 from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.tobit.hold import HoldCentre, hold_centre
 from fusion_gym.systems.tobit.joint import JointCentre, joint_centre
 from fusion_gym.systems.tobit.linear_sensors import linear_sensors
 from fusion_gym.systems.tobit.options import (
@@ -34,7 +35,13 @@ _FILTERS = {
     "adf": FILTERS["adf"],
     "stochastic": FILTERS["stochastic"],
     "joint": Filter(JointCentre, joint_centre, nodes=False),
+    "hold": Filter(
+        HoldCentre,
+        lambda options, sensors: hold_centre(options, sensors, _plant(options)),
+        nodes=False,
+    ),
 }
+_HELD = "a centre that holds values cannot hold an estimate"
 _STEP = 0.1  # seconds between two samples of the default target
 # Observed variances are relative to those after so many silent steps: a target that nobody sees
 # drifts far beyond what is ever unknown of it.
@@ -108,7 +115,8 @@ class LinearFusionOptions(FeedbackOptions):
     """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
     ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
     assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
-    is the Kalman filter for the policy ``stochastic_event``."""
+    is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the least-squares state
+    of the last delivered values, without a filter."""
 
     def nominal(self) -> LinearFusionOptions:
         """Return the options whose simulation scales the reward, equal for all filters."""
@@ -137,12 +145,15 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     names = _names(choice.state_names, plant.size)
     system = make_system(choice, plant, centre, names, _REFERENCE_HORIZON)
     system = replace(system, known_start=True)
+    holds = choice.filter == "hold"
+    kind = "kalman" if holds and choice.memory_filter is None else choice.memory_filter
     return Scenario(
         choice,
         system,
         policy_defaults=stochastic_defaults(choice),
         feedback=True,
-        memory_system=memory_filter_system(system, choice.memory_filter, _FILTERS, choice, sensors),
+        memory_system=memory_filter_system(system, kind, _FILTERS, choice, sensors),
+        no_estimates=_HELD if holds else None,
     )
 
 

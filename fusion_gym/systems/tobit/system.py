@@ -28,7 +28,6 @@ from fusion_gym.core.system import (
     numbered,
     sensed,
 )
-from fusion_gym.fusion.rules import InformationFusion
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, Feedback
@@ -98,8 +97,7 @@ class CensoredSystem(System[CensoredState]):
     @property
     def numpy_only(self) -> str | None:
         """See :class:`System`."""
-        fusion = getattr(self.centre, "fusion", None)
-        return None if fusion is None or isinstance(fusion, InformationFusion) else "fusion"
+        return self.centre.numpy_only
 
     @property
     def sensor_count(self) -> int:
@@ -272,17 +270,16 @@ class CensoredSystem(System[CensoredState]):
         r, departure = self.plant.noise_channels, state.departure
         process, own = true_noise(departure, noise[:r], noise[r:])
         truth = self.plant.advance(state.truth, process, departure)
-        prior_mean, prior_covariance = self.model.predict(state.mean, state.covariance)
-        time = state.time + 1.0
+        (prior_mean, prior_covariance), prediction = self.centre.advance(self.model, state)
         return replace(
             state,
             truth=truth,
             measurement=self.centre.sensors.measure(truth, own, departure),
             age=state.age + 1.0,
-            time=time,
+            time=state.time + 1.0,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
-            prediction=self.centre.predict(prior_mean, prior_covariance, state.held, time),
+            prediction=prediction,
         )
 
     def deliver(self, state: CensoredState, granted: NDArray[np.bool_]) -> CensoredState:
