@@ -138,6 +138,35 @@ class Rule:
         raise TypeError(f"{type(self).__name__} must implement __call__")
 
 
+@dataclasses.dataclass(kw_only=True)
+class LocalRule(Rule):
+    """Base class of the rules of single sensors, with the intervals of devices.
+
+    Args:
+        min_interval: least steps between two deliveries of a sensor, >= 1.
+        max_interval: most steps between two deliveries of a sensor; None for no limit.
+
+    Raises:
+        ConfigurationError: an interval below 1, or a max_interval below min_interval.
+    """
+
+    min_interval: int = 1
+    max_interval: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        least = validation.integer("min_interval", self.min_interval, at_least=1)
+        if self.max_interval is not None:
+            validation.integer("max_interval", self.max_interval, at_least=least)
+
+    def limit(self, requests: Requests, signals: Signals) -> Requests:
+        """Return the requests (sensors, N) within the intervals."""
+        age = signals["age"]
+        if self.max_interval is not None:
+            requests = requests | (age >= self.max_interval)
+        return requests if self.min_interval == 1 else requests & (age >= self.min_interval)
+
+
 def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:
     """Return the field of a parameter with its default and ``check(name, value, **limits)``."""
     check = functools.partial(check, **limits)

@@ -71,6 +71,7 @@ _ROWS: dict[str, PolicyRow] = {
         "periodic_optimum": "periodic_optimum:PeriodicOptimum",
         "priced_threshold": "rules.priced_threshold:PricedThreshold",
         "random": "rules.random:Random",
+        "report_on_change": "rules.report_on_change:ReportOnChange",
         "rollout": "rollout:Rollout",
         "round_robin": "rules.periodic:RoundRobin",
         "send_on_delta": "rules.send_on_delta:SendOnDelta",
@@ -178,8 +179,9 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
 
     Example:
         >>> from fusion_gym import make_policy, make_task
-        >>> make_policy("send_on_delta:threshold=2", make_task("fusion_gym/TobitOscillator-v1"))
-        SendOnDelta(threshold=2)
+        >>> task = make_task("fusion_gym/TobitOscillator-v1")
+        >>> make_policy("send_on_delta:threshold=2", task).threshold
+        2
     """
     context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)

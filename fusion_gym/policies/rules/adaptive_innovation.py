@@ -7,9 +7,9 @@ import numpy as np
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
+    LocalRule,
     PerSensor,
     Requests,
-    Rule,
     not_negative_parameter,
     parameter,
     surprise,
@@ -17,7 +17,7 @@ from fusion_gym.policies.base import (
 
 
 @dataclass
-class AdaptiveInnovation(Rule):
+class AdaptiveInnovation(LocalRule):
     r"""Request when |ε|² >= a exp(-(b + c |ε at the last request|)), with ε the innovation.
 
     A large innovation lowers the threshold. Before the first request of an episode the stored
@@ -31,6 +31,8 @@ class AdaptiveInnovation(Rule):
         threshold: a >= 0, in squared units of the measurement; 0 always requests.
         offset: b >= 0, without unit.
         sensitivity: c >= 0, in the inverse unit of the measurement; 0 is a fixed threshold.
+        min_interval: least steps between two deliveries of a sensor, >= 1.
+        max_interval: most steps between two deliveries of a sensor; None for no limit.
 
     Equation:
         $$
@@ -81,6 +83,6 @@ class AdaptiveInnovation(Rule):
             self._last = np.zeros(squared.shape)
         last = np.where(signals["start"], 0.0, self._last)
         threshold = self.threshold_after(last)
-        request: Requests = squared >= threshold
+        request = self.limit(squared >= threshold, signals)
         self._last = np.where(request, np.sqrt(squared), last)
         return request

@@ -7,11 +7,11 @@ import numpy as np
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Knowledge, Signals
-from fusion_gym.policies.base import PerSensor, Requests, Rule, parameter, shape_of
+from fusion_gym.policies.base import LocalRule, PerSensor, Requests, parameter, shape_of
 
 
 @dataclass
-class AdaptiveThreshold(Rule):
+class AdaptiveThreshold(LocalRule):
     r"""Request when |σ|² > ρ, with σ the measurement minus the last delivered measurement.
 
     The threshold follows ρ' = ρ̄ + |σ|²/(λ + |σ|²) (ρ - ρ̄) in every step, with σ before the
@@ -26,6 +26,8 @@ class AdaptiveThreshold(Rule):
         rho_initial: ρ₀ <= ρ̄, the threshold at an episode's start.
         adaptation: λ > 0, in squared units of the measurement.
         scale: factor of ρ̄ and ρ₀, for sweeps.
+        min_interval: least steps between two deliveries of a sensor, >= 1.
+        max_interval: most steps between two deliveries of a sensor; None for no limit.
 
     Raises:
         ConfigurationError: not 0 <= ρ₀ <= ρ̄ <= 1, or λ <= 0, or a negative scale.
@@ -94,6 +96,6 @@ class AdaptiveThreshold(Rule):
         rho = np.where(start, initial, self._rho)
         difference = signals["measurement"] - signals["held"]
         squared = linalg.dot(difference, difference)
-        request: Requests = squared > rho
+        request = self.limit(squared > rho, signals)
         self._rho = self.threshold_after(rho, squared)
         return request

@@ -9,9 +9,9 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
+    LocalRule,
     PerSensor,
     Requests,
-    Rule,
     each_number,
     not_negative_parameter,
     parameter,
@@ -20,7 +20,7 @@ from fusion_gym.policies.base import (
 
 
 @dataclass
-class DynamicEvent(Rule):
+class DynamicEvent(LocalRule):
     r"""Request when |ε| >= η/χ + σ, with ε the last requested minus the current measurement.
 
     The dynamic variable follows η' = λ η + σ - |ε|, where ε is zero after a request. It is clipped
@@ -33,6 +33,8 @@ class DynamicEvent(Rule):
         divisor: χ > 0, without unit.
         initial: η₀ >= 0, in the unit of the measurement.
         scale: factor of σ and η₀, for sweeps.
+        min_interval: least steps between two deliveries of a sensor, >= 1.
+        max_interval: most steps between two deliveries of a sensor; None for no limit.
 
     Equation:
         $$
@@ -82,7 +84,7 @@ class DynamicEvent(Rule):
         requested = np.where(start, signals["held"], self._requested)
         difference = requested - measurement
         size = np.sqrt(linalg.dot(difference, difference))
-        request: Requests = size >= eta / self.column("divisor", sensors) + sigma
+        request = self.limit(size >= eta / self.column("divisor", sensors) + sigma, signals)
         error = np.where(request, 0.0, size)
         decay = self.column("decay", sensors)
         self._eta = np.maximum(decay * eta + sigma - error, 0.0)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from fusion_gym import validation
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
+    LocalRule,
     PerSensor,
     Requests,
-    Rule,
     check_at_most,
     not_negative_parameter,
     parameter,
@@ -17,13 +17,15 @@ from fusion_gym.policies.base import (
 
 
 @dataclass
-class InnovationThreshold(Rule):
+class InnovationThreshold(LocalRule):
     r"""Request when the Euclidean norm of the innovation is at least ``threshold``.
 
     Args:
         threshold: θ >= 0, in the unit of the measurement, or without a unit.
         whitened: take the innovation in predicted standard deviations.
         at_most: most requests in a step, by the largest norm; None for no limit.
+        min_interval: least steps between two deliveries of a sensor, >= 1.
+        max_interval: most steps between two deliveries of a sensor; None for no limit.
 
     Equation:
         $$
@@ -57,5 +59,5 @@ class InnovationThreshold(Rule):
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         norm = surprise(signals, self.whitened) ** 0.5
-        requests = norm >= self.column("threshold", len(norm))
+        requests = self.limit(norm >= self.column("threshold", len(norm)), signals)
         return strongest(norm, requests, self.at_most, signals["age"])

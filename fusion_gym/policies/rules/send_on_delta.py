@@ -6,9 +6,9 @@ from typing import ClassVar
 from fusion_gym import linalg
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
+    LocalRule,
     PerSensor,
     Requests,
-    Rule,
     not_negative_parameter,
     parameter,
     shape_of,
@@ -16,11 +16,13 @@ from fusion_gym.policies.base import (
 
 
 @dataclass
-class SendOnDelta(Rule):
+class SendOnDelta(LocalRule):
     r"""Request when the measurement differs from the last delivered one by ``threshold`` or more.
 
     Args:
         threshold: θ >= 0, in the unit of the measurement.
+        min_interval: least steps between two deliveries of a sensor, >= 1.
+        max_interval: most steps between two deliveries of a sensor; None for no limit.
 
     Equation:
         $$
@@ -46,4 +48,4 @@ class SendOnDelta(Rule):
         """Return the requests (sensors, N)."""
         moved = signals["measurement"] - signals["held"]
         threshold = self.column("threshold", shape_of(signals)[0])
-        return linalg.dot(moved, moved) >= threshold * threshold
+        return self.limit(linalg.dot(moved, moved) >= threshold * threshold, signals)

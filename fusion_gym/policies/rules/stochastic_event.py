@@ -8,9 +8,9 @@ import numpy as np
 from fusion_gym import validation
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
+    LocalRule,
     PerSensor,
     Requests,
-    Rule,
     not_negative_parameter,
     parameter,
     surprise,
@@ -21,7 +21,7 @@ _STREAM = 0x73746F6368  # makes draws independent of the noise of the same seed
 
 
 @dataclass
-class StochasticEvent(Rule):
+class StochasticEvent(LocalRule):
     r"""Keep each sensor silent with probability exp(-w |z|² / 2), with z its innovation.
 
     The weight w is the paper's Z, here a multiple of the identity for each sensor. Given silence
@@ -32,6 +32,8 @@ class StochasticEvent(Rule):
         weight: w >= 0, in the inverse squared unit of the measurement, or without a unit; 0 never
             requests.
         whitened: take the innovation in predicted standard deviations.
+        min_interval: least steps between two deliveries of a sensor, >= 1.
+        max_interval: most steps between two deliveries of a sensor; None for no limit.
 
     Equation:
         $$
@@ -69,4 +71,4 @@ class StochasticEvent(Rule):
         """Return the requests (sensors, N)."""
         squared = surprise(signals, self.whitened)
         silence = np.exp(-0.5 * self.column("weight", len(squared)) * squared)
-        return self._chance.draw(*squared.shape) >= silence
+        return self.limit(self._chance.draw(*squared.shape) >= silence, signals)
