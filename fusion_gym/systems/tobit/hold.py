@@ -60,8 +60,8 @@ class HoldCentre(Centre):
     @functools.cached_property
     def inverse(self) -> Array:
         """C⁺ (n, channels, 1)."""
-        inverse: Array = np.linalg.pinv(self.sensors.stacked_matrix[..., 0])
-        return inverse[..., None]
+        inverse = np.linalg.pinv(self.sensors.stacked_matrix[..., 0])
+        return np.asarray(inverse, dtype=np.float64)[..., None]
 
     @functools.cached_property
     def motion(self) -> tuple[Array, Array]:
