@@ -187,6 +187,7 @@ class Scenario:
         nodes_have_memory: Whether a packet holds all past measurements of its node, so that no
             ``memory_system`` is needed.
         no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
+        required_policy: The policy whose silence the filter reads, or ``None``.
     """
 
     options: CommonOptions
@@ -197,6 +198,7 @@ class Scenario:
     memory_system: System[Any] | None = None
     nodes_have_memory: bool = False
     no_estimates: str | None = None
+    required_policy: str | None = None
 
 
 def plain_options(value: Any) -> Any:

@@ -114,6 +114,7 @@ class Runs:
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self.task, self.memory, self.layout = task, memory, layout
+        self._silence = task.system.offers("with_possible")
         self._delivered: Any = None
 
     @property
@@ -139,7 +140,10 @@ class Runs:
         """Make the first half of a step with requests (sensors, N): grant, update, fuse, reward."""
         task, system = self.task, self.task.system
         granted, spent, tokens, self.queue = self.answer(requests)
-        state = self.memory.deliver(self.state, system.deliver(self.state, granted), granted)
+        state = self.state
+        if self._silence:
+            state = system.with_possible(state, self._possible(granted, spent))
+        state = self.memory.deliver(self.state, system.deliver(state, granted), granted)
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
         squared_error = error * error
@@ -260,6 +264,13 @@ class Runs:
         }
         values |= self.memory.signals(self.beliefs)
         return Signals(values, self.task.hidden_signals, self.memory.missing_signals)
+
+    def _possible(self, granted: NDArray[np.bool_], spent: Array) -> NDArray[np.bool_]:
+        """Return the sensors (sensors, N) whose request the network would also have granted."""
+        bucket = self.task.bucket
+        tokens = self.tokens if bucket.sharing == "equal" else self.tokens - spent
+        possible = self.admitted() & bucket.affordable(tokens)
+        return possible & ~granted.any(0) if self.task.access == "single" else possible
 
     def _lottery(self) -> Array | None:
         """Return the standard normals (N,) for random access, or ``None`` with another rule."""

@@ -321,6 +321,7 @@ class Signals(Mapping[str, SignalArray]):
 CAPABILITIES = (
     *("adopt", "arrival_probability", "arriving", "covariance_cycle", "error_covariance"),
     *("single_deliveries", "imagination_channels", "imagine", "with_actual_covariance"),
+    "with_possible",
 )
 
 
@@ -582,6 +583,15 @@ class System(ABC, Generic[StateT]):
         Systems whose covariances depend only on the deliveries offer it.
         """
         raise self._missing("covariance_cycle")
+
+    def with_possible(self, state: StateT, possible: NDArray[np.bool_]) -> StateT:
+        """Return the state for a delivery of which silence is information.
+
+        Args:
+            state: State after :meth:`sense`.
+            possible: Sensors (sensors, N) whose requests the network would have granted.
+        """
+        raise self._missing("with_possible")
 
     def with_actual_covariance(self) -> System[StateT]:
         """Return the same system with states that :meth:`error_covariance` can evaluate."""

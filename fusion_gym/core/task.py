@@ -60,6 +60,7 @@ class Task:
             (:mod:`fusion_gym.core.scale`); ``None`` uses the errors without transmissions.
         settings: The user's options, for reports.
         policy_defaults: The scenario's parameters of named policies.
+        required_policy: The only policy that may run, or ``None``.
 
     Raises:
         ConfigurationError: A mode is unknown, the horizon is below 1, or the parts do not fit.
@@ -85,6 +86,7 @@ class Task:
     nominal_error: Array | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
+    required_policy: str | None = None
 
     def __post_init__(self) -> None:
         validation.horizon(self.horizon)
@@ -169,6 +171,7 @@ class Task:
             nominal_error=nominal_error,
             settings=plain_options(asdict(options)),
             policy_defaults=scenario.policy_defaults,
+            required_policy=scenario.required_policy,
         )
 
     @property

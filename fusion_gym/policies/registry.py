@@ -5,6 +5,7 @@ names a saved agent, with settings after a comma. ``package.module:Class`` or
 ``package.module:Class:key=value`` names a class of the user.
 """
 
+import dataclasses
 import importlib
 import inspect
 import re
@@ -185,6 +186,8 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     """
     context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)
+    if task.required_policy is not None:
+        _check_required(spec, policy, _make(task.required_policy, task.policy_defaults, context))
     if _kind(_parse_policy(spec)[1]) != "agent":  # the loader has checked its observation
         _try_out(spec, policy, task)
     return policy
@@ -221,6 +224,17 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
             f"{', '.join(map(repr, KNOWLEDGE))}"
         )
     return policy
+
+
+def _check_required(spec: str, policy: Policy, required: Any) -> None:
+    """Refuse a policy whose silence another filter would read."""
+    names = [field.name for field in dataclasses.fields(required)]
+    values = [(name, getattr(required, name)) for name in names if name != "max_interval"]
+    if type(policy) is not type(required) or any(
+        not np.array_equal(getattr(policy, name), value) for name, value in values
+    ):
+        allowed = f"{required!r}, whose silence the filter reads; only max_interval may differ"
+        raise refusal("policy", spec, allowed, "with filter='truncated'")
 
 
 def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:

@@ -101,6 +101,7 @@ VARIANTS: dict[str, list[Options]] = {
         {"censoring_threshold": (-2.0, -2.0), "access": "round_robin"},
         {"filter": "adf", "packet": "estimate"} | NOISY,
         {"filter": "hold", "memory": True, "access": "any"} | SCARCE,
+        {"filter": "truncated", "trigger": "report_on_change", "trigger_threshold": 0.8},
         {
             "measurement_matrices": [[1, 0], [[0, 1], [1, 1]]],
             "joint_measurement_covariance": [[0.3, 0.2, 0.1], [0.2, 0.3, 0.1], [0.1, 0.1, 0.2]],

@@ -192,7 +192,7 @@ def deterministic_variance(case: Case) -> bool:
     settings = case.task().settings
     return (
         "Biased" not in case.env_id
-        and settings.get("filter") not in ("adf", "imm")
+        and settings.get("filter") not in ("adf", "imm", "truncated")
         and settings.get("channel", "perfect") == "perfect"
         and not ("UnknownInput" in case.env_id and settings["fusion"] == "ci")
     )

@@ -33,8 +33,9 @@ class CentrePrediction(NamedTuple):
 
     ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
     (n, n, N) of the covariance without a transmission, and, where nodes have covariances of their
-    own, their ``outcomes`` z of x = x̂ + G z. A centre that holds values has them as ``held``, and
-    their ``moment``.
+    own, their ``outcomes`` z of x = x̂ + G z. A centre that uses held values has them as ``held``,
+    a hold its ``moment``; ``possible`` (sensors, N) are the sensors that the network would have
+    granted, ``None`` for all.
     """
 
     expectation: Expectation
@@ -43,6 +44,7 @@ class CentrePrediction(NamedTuple):
     outcomes: Outcomes | None = None
     held: Any = None
     moment: Any = None
+    possible: Any = None
 
 
 class Centre(Protocol):
@@ -61,6 +63,11 @@ class Centre(Protocol):
     @property
     def separable(self) -> bool:
         """Whether :meth:`single` is available, and faster than one update after another."""
+        return False
+
+    @property
+    def reads_silence(self) -> bool:
+        """Whether a step without a delivery is information."""
         return False
 
     @property

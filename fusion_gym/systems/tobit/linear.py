@@ -28,6 +28,7 @@ from fusion_gym.systems.tobit.options import (
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
+from fusion_gym.systems.tobit.truncated import TRIGGERS, TruncatedCentre, truncated_centre
 
 _FILTERS = {
     "kalman": FILTERS["kalman"],
@@ -39,6 +40,9 @@ _FILTERS = {
         HoldCentre,
         lambda options, sensors: hold_centre(options, sensors, _plant(options)),
         nodes=False,
+    ),
+    "truncated": Filter(
+        TruncatedCentre, truncated_centre, own=("trigger", "trigger_threshold"), nodes=False
     ),
 }
 _HELD = "a centre that holds values cannot hold an estimate"
@@ -116,7 +120,13 @@ class LinearFusionOptions(FeedbackOptions):
     ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
     assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
     is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the least-squares state
-    of the last delivered values, without a filter."""
+    of the last delivered values, without a filter. ``"truncated"`` is one Kalman filter at the
+    centre that uses the silence of the policy ``trigger``; other policies are refused."""
+    trigger: Literal["innovation_threshold", "report_on_change", "send_on_delta"] | None = None
+    """Policy whose silence ``filter="truncated"`` uses."""
+    trigger_threshold: ArrayLike | None = None
+    """Threshold or reportable change of the policy ``trigger``: one number, or one per sensor, in
+    the unit of the measurement."""
 
     def nominal(self) -> LinearFusionOptions:
         """Return the options whose simulation scales the reward, equal for all filters."""
@@ -127,6 +137,8 @@ class LinearFusionOptions(FeedbackOptions):
             information_shares=None,
             order=None,
             stochastic_weight=None,
+            trigger=None,
+            trigger_threshold=None,
         )
 
 
@@ -147,14 +159,24 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     system = replace(system, known_start=True)
     holds = choice.filter == "hold"
     kind = "kalman" if holds and choice.memory_filter is None else choice.memory_filter
+    defaults = stochastic_defaults(choice)
+    if choice.trigger is not None:
+        defaults[choice.trigger] = {TRIGGERS[choice.trigger]: _plain(choice.trigger_threshold)}
     return Scenario(
         choice,
         system,
-        policy_defaults=stochastic_defaults(choice),
+        policy_defaults=defaults,
         feedback=True,
         memory_system=memory_filter_system(system, kind, _FILTERS, choice, sensors),
         no_estimates=_HELD if holds else None,
+        required_policy=choice.trigger,
     )
+
+
+def _plain(value: Any) -> Any:
+    """Return a threshold as a number or a tuple, as policies take it."""
+    plain = plain_options(value)
+    return tuple(plain) if isinstance(plain, list) else plain
 
 
 def _plant(options: LinearFusionOptions) -> LinearPlant:

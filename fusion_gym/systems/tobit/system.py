@@ -94,6 +94,10 @@ class CensoredSystem(System[CensoredState]):
     signals = SIGNALS
     extensions = ("state_weights", "with_model")
 
+    def with_possible(self, state: CensoredState, possible: NDArray[np.bool_]) -> CensoredState:
+        """See :class:`System`."""
+        return replace(state, prediction=sensed(state.prediction)._replace(possible=possible))
+
     @property
     def numpy_only(self) -> str | None:
         """See :class:`System`."""
@@ -155,6 +159,8 @@ class CensoredSystem(System[CensoredState]):
         With federated fusion, or one filter at the centre, the covariances are then the actual ones
         if ``model`` is the plant; with covariance intersection they are bounds.
         """
+        if capability == "with_possible":
+            return self.centre.reads_silence
         if capability == "covariance_cycle":
             return self.centre.predictable
         if capability == "single_deliveries":

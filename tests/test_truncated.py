@@ -1,0 +1,156 @@
+"""Silence as information: against quadrature, a particle filter and the filters that ignore it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation import run_episodes, summarise
+from fusion_gym.validation import ConfigurationError
+
+LINEAR = "fusion_gym/LinearFusion-v2"
+FREE = {"tokens": "unlimited"}
+
+
+def make(trigger: str = "send_on_delta", threshold: Any = 2.0, **options: Any) -> Task:
+    truncated = {"filter": "truncated", "trigger": trigger, "trigger_threshold": threshold}
+    return fusion_gym.make_task(LINEAR, **truncated | options)
+
+
+def moments(low: Any, high: Any, mean: Any, deviation: Any) -> tuple[Any, Any]:
+    """Mean and variance of N(mean, deviation²) between two ends, by Gauss-Legendre quadrature."""
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    ends = np.clip([low, high], mean - 12.0 * deviation, mean + 12.0 * deviation)
+    y = ends.mean(0) + 0.5 * np.diff(ends, axis=0)[0] * nodes[:, None]
+    weights = weights[:, None] * np.exp(-0.5 * ((y - mean) / deviation) ** 2)
+    first = (weights * y).sum(0) / weights.sum(0)
+    return first, (weights * (y - first) ** 2).sum(0) / weights.sum(0)
+
+
+@pytest.mark.parametrize("trigger", ["send_on_delta", "report_on_change", "innovation_threshold"])
+def test_a_silent_update_is_the_truncation_by_quadrature(trigger: str) -> None:
+    batch = EpisodeBatch.seeded(make(trigger, (0.7, 1e6), **FREE), 50, 0)
+    for step in range(20):
+        state, sensors = batch.state, batch.task.system.centre.sensors
+        row = sensors.measurement_matrix[0, 0, :, 0]
+        across = np.einsum("ijn,j->in", state.prior_covariance, row)
+        variance = row @ across + sensors.variance[0, 0, 0]
+        mean = row @ state.prior_mean
+        middle = mean if trigger == "innovation_threshold" else state.held[0, 0]
+        first, second = moments(middle - 0.7, middle + 0.7, mean, variance**0.5)
+        gain = across / variance
+        sent = np.zeros((2, 50), dtype=np.bool_)
+        silent = batch.task.system.deliver(state, sent)
+        expected = state.prior_mean + gain * (first - mean)
+        np.testing.assert_allclose(silent.mean, expected, atol=1e-8)
+        loss = gain[:, None] * gain * (variance - second)
+        np.testing.assert_allclose(silent.covariance, state.prior_covariance - loss, atol=1e-8)
+        sent[step % 2] = np.arange(50) % 5 == step % 5
+        batch.step(sent)
+
+
+def test_silence_without_tokens_is_no_information() -> None:
+    options: dict[str, Any] = {"token_rate": 1.0, "initial_tokens": 6.0}
+    task, plain = make(**options), fusion_gym.make_task(LINEAR, **options)
+    batches = [EpisodeBatch.seeded(t, 4, 0) for t in (task, plain)]
+    for batch in batches:
+        batch.step(np.ones((2, 4), dtype=np.bool_))  # six tokens, of which one returns
+        batch.step(np.zeros((2, 4), dtype=np.bool_))
+    ours, theirs = (batch.delivered for batch in batches)
+    np.testing.assert_allclose(ours.mean, theirs.mean, atol=1e-12)
+    np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-12)
+
+
+def figures(task: Task, rule: str, episodes: int = 1000) -> dict[str, Any]:
+    return summarise(run_episodes(task, fusion_gym.make_policy(rule, task), episodes, 0))
+
+
+@pytest.mark.parametrize("threshold", [1.0, 2.1])
+def test_silence_beats_hold_and_a_filter_that_ignores_it(threshold: float) -> None:
+    """At rates .22 and .05; the lead exceeds a fifth at .05, and the covariance is honest."""
+    rule = f"send_on_delta:threshold={threshold}"
+    truncated = figures(make(threshold=threshold, **FREE), rule)
+    assert 0.9 < truncated["nees"]["mean"] < 1.15
+    for kind in ("hold", "kalman"):
+        other = figures(fusion_gym.make_task(LINEAR, filter=kind, **FREE), rule)
+        np.testing.assert_allclose(other["rate"], truncated["rate"], atol=1e-12)
+        assert truncated["mse"]["high"] < 0.8 * other["mse"]["low"]
+
+
+def test_denied_requests_leave_the_covariance_honest() -> None:
+    task = make(threshold=1.5, token_rate=1.0, initial_tokens=3.0, token_capacity=6.0)
+    result = figures(task, "send_on_delta")
+    denied = np.sum(result["denied"]["mean"]) / np.sum(result["requests"])
+    assert 0.1 < denied < 0.2
+    assert 0.8 < result["nees"]["mean"] < 1.35
+
+
+@pytest.mark.parametrize("threshold", [1.0, 2.0])
+def test_the_error_is_that_of_a_particle_filter(threshold: float) -> None:
+    """Within 2 %, on the same 150 runs of 60 steps with 1,500 particles each."""
+    runs, particles, task = 150, 1500, make(threshold=threshold, **FREE)
+    batch, system = EpisodeBatch.seeded(task, runs, 0), task.system
+    rule, rng = fusion_gym.make_policy("send_on_delta", task), np.random.default_rng(0)
+    transition = system.plant.transition[..., 0]
+    factor = np.linalg.cholesky(system.plant.process_covariance[..., 0])
+    deviation = system.centre.sensors.deviation[:, 0, 0]
+    start = batch.state.held[:, 0]  # both states are measured at the start
+    gain = 1.0 / (1.0 + deviation**2)[:, None]
+    mean, spread = gain * start, (1.0 - gain[:, 0]) ** 0.5
+    cloud = mean[..., None] + spread[:, None, None] * rng.normal(size=(2, runs, particles))
+    errors = np.zeros(2)
+    for _ in range(60):
+        noise = np.tensordot(factor, rng.normal(size=cloud.shape), 1)
+        cloud = np.tensordot(transition, cloud, 1) + noise
+        held, measurement = batch.state.held[:, 0], batch.state.measurement[:, 0]
+        requests = rule(batch.signals())
+        batch.step(requests)
+        weights = np.ones((runs, particles))
+        for s in range(2):
+            ends = (held[s][:, None] + side * threshold for side in (-1.0, 1.0))
+            low, high = (norm.cdf((end - cloud[s]) / deviation[s]) for end in ends)
+            density = norm.pdf((measurement[s][:, None] - cloud[s]) / deviation[s])
+            weights *= np.where(requests[s][:, None], density, high - low)
+        weights /= weights.sum(1, keepdims=True)
+        state = batch.delivered
+        for place, estimate in enumerate((state.mean, (weights * cloud).sum(-1))):
+            errors[place] += ((state.truth - estimate) ** 2).sum()
+        steps = (rng.random((runs, 1)) + np.arange(particles)) / particles
+        chosen = [
+            np.searchsorted(np.cumsum(w), x).clip(max=particles - 1)
+            for w, x in zip(weights, steps, strict=True)
+        ]
+        cloud = np.take_along_axis(cloud, np.stack(chosen)[None], axis=-1)
+    assert errors[0] / errors[1] == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"trigger": None}, ("trigger = None", "filter='truncated'")),
+        ({"trigger_threshold": -1.0}, ("trigger_threshold = -1.0", ">= 0")),
+        ({"trigger_threshold": [1.0, 2.0, 3.0]}, ("trigger_threshold", "shape (2,)")),
+        ({"censoring_threshold": 0.0}, ("filter = 'truncated'", "censored")),
+        ({"measurement_matrices": [[[1, 0], [0, 1]]]}, ("trigger", "'report_on_change'")),
+        ({"filter": "kalman"}, ("trigger = 'send_on_delta'", "filter='kalman'")),
+        ({"backend": "jax"}, ("filter = 'truncated'", "JAX")),
+    ],
+)
+def test_what_does_not_fit_is_refused(options: dict[str, Any], words: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        make(**options)
+    assert all(word in str(error.value) for word in words)
+
+
+@pytest.mark.parametrize(
+    "rule",
+    ["always", "send_on_delta:threshold=1", "send_on_delta:min_interval=2", "report_on_change"],
+)
+def test_other_policies_are_refused(rule: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"^policy = .*truncated.*SendOnDelta"):
+        fusion_gym.make_policy(rule, make())
+    fusion_gym.make_policy("send_on_delta:max_interval=9", make())
