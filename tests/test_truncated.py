@@ -1,5 +1,6 @@
 """Silence as information: against quadrature, a particle filter and the filters that ignore it."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from fusion_gym.evaluation import run_episodes, summarise
 from fusion_gym.validation import ConfigurationError
 
 LINEAR = "fusion_gym/LinearFusion-v2"
+REMOTE = "fusion_gym/RemoteEstimation-v1"
 FREE = {"tokens": "unlimited"}
 
 
@@ -51,6 +53,45 @@ def test_a_silent_update_is_the_truncation_by_quadrature(trigger: str) -> None:
         np.testing.assert_allclose(silent.covariance, state.prior_covariance - loss, atol=1e-8)
         sent[step % 2] = np.arange(50) % 5 == step % 5
         batch.step(sent)
+
+
+def test_silence_of_a_lossy_source_is_a_mixture_by_quadrature() -> None:
+    """Inside the interval silence is certain, outside it has the probability of a loss."""
+    options = {"channel": "independent", "drop_probability": 0.3, "coefficient": 0.9}
+    task = fusion_gym.make_task(
+        REMOTE, filter="truncated", trigger="send_on_delta", trigger_threshold=1.4, **options
+    )
+    batch = EpisodeBatch.seeded(task, 40, 0)
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    for step in range(12):
+        state = batch.state
+        mean, deviation = state.prior[0], state.prior_variance[0] ** 0.5
+        middle, total = state.held[0], np.zeros((3, 40))
+        edges = [mean - 12 * deviation, middle - 1.4, middle + 1.4, mean + 12 * deviation]
+        for low, high in itertools.pairwise(np.sort(edges, axis=0)):
+            x = 0.5 * (low + high) + 0.5 * (high - low) * nodes[:, None]
+            density = norm.pdf(x, mean, deviation) * np.where(abs(x - middle) < 1.4, 1.0, 0.3)
+            mass = 0.5 * (high - low) * weights[:, None] * density
+            total += [(mass * x**k).sum(0) for k in range(3)]
+        first = total[1] / total[0]
+        silent = batch.task.system.deliver(state, np.zeros((1, 40), dtype=np.bool_))
+        np.testing.assert_allclose(silent.estimate[0], first, atol=1e-8)
+        np.testing.assert_allclose(silent.variance[0], total[2] / total[0] - first**2, atol=1e-8)
+        batch.step((np.arange(40) % 6 == step % 6)[None])
+
+
+def test_the_variance_of_a_silent_source_is_its_squared_error() -> None:
+    for options in ({}, {"channel": "independent"}):
+        results = []
+        for name in ("truncated", "symmetric"):
+            trigger: dict[str, Any] = {"trigger": "send_on_delta", "trigger_threshold": 2.0}
+            chosen = trigger if name == "truncated" else {}
+            task = fusion_gym.make_task(REMOTE, filter=name, **chosen, **options)
+            results.append(figures(task, "send_on_delta:threshold=2"))
+        ours, theirs = (result["mse"]["mean"] for result in results)
+        assert ours == pytest.approx(theirs, rel=1e-9)  # a symmetric interval leaves the mean
+        claimed = [result["bound_trace"]["mean"] for result in results]
+        assert abs(claimed[0] / ours - 1.0) < 0.15 < abs(claimed[1] / ours - 1.0)
 
 
 def test_silence_without_tokens_is_no_information() -> None:

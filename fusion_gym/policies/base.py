@@ -161,10 +161,11 @@ class LocalRule(Rule):
 
     def limit(self, requests: Requests, signals: Signals) -> Requests:
         """Return the requests (sensors, N) within the intervals."""
-        age = signals["age"]
         if self.max_interval is not None:
-            requests = requests | (age >= self.max_interval)
-        return requests if self.min_interval == 1 else requests & (age >= self.min_interval)
+            requests = requests | (signals["age"] >= self.max_interval)
+        if self.min_interval > 1:
+            requests = requests & (signals["age"] >= self.min_interval)
+        return requests
 
 
 def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:

@@ -187,7 +187,8 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)
     if task.required_policy is not None:
-        _check_required(spec, policy, _make(task.required_policy, task.policy_defaults, context))
+        required = _make(task.required_policy, task.policy_defaults, context)
+        _check_required(spec, policy, task, required)
     if _kind(_parse_policy(spec)[1]) != "agent":  # the loader has checked its observation
         _try_out(spec, policy, task)
     return policy
@@ -226,15 +227,19 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
     return policy
 
 
-def _check_required(spec: str, policy: Policy, required: Any) -> None:
+def _check_required(spec: str, policy: Any, task: Task, required: Any) -> None:
     """Refuse a policy whose silence another filter would read."""
-    names = [field.name for field in dataclasses.fields(required)]
-    values = [(name, getattr(required, name)) for name in names if name != "max_interval"]
-    if type(policy) is not type(required) or any(
-        not np.array_equal(getattr(policy, name), value) for name, value in values
+    thresholds = task.policy_defaults[str(task.required_policy)]
+    names = {field.name for field in dataclasses.fields(required)} - {"max_interval"}
+    if type(policy) is type(required) and all(
+        np.array_equal(policy.column(name, task.sensors), required.column(name, task.sensors))
+        if name in thresholds
+        else getattr(policy, name) == getattr(required, name)
+        for name in names
     ):
-        allowed = f"{required!r}, whose silence the filter reads; only max_interval may differ"
-        raise refusal("policy", spec, allowed, "with filter='truncated'")
+        return
+    allowed = f"{required!r}, whose silence the filter reads; only max_interval may differ"
+    raise refusal("policy", spec, allowed, "with filter='truncated'")
 
 
 def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:

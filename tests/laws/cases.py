@@ -110,6 +110,7 @@ VARIANTS: dict[str, list[Options]] = {
     "RemoteEstimation": [
         LOSSY | {"access": "single", "initial_deviation": 1.0},
         {"sensors": 2, "channel": "independent"},
+        LOSSY | {"filter": "truncated", "trigger": "send_on_delta", "trigger_threshold": 1.5},
         LOSSY | {"information": "centre"} | SCARCE,
         LOSSY | {"memory": True, "true_transition": (0.8, 0.95)},
     ],

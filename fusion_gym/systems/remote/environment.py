@@ -7,8 +7,9 @@ Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +21,10 @@ from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
+from fusion_gym.systems.silence import Silence, Trigger
 from fusion_gym.validation import ConfigurationError
+
+_FILTERS: dict[str, type] = {"symmetric": RemoteEstimationSystem, "truncated": Silence}
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,7 @@ class RemoteEstimationOptions(PaperOptions):
         (2, 200)
     """
 
+    filters: ClassVar[Mapping[str, type]] = _FILTERS
     sensors: int = 1
     """Number of sources, each with one sensor."""
     coefficient: ArrayLike = 1.0
@@ -71,6 +76,13 @@ class RemoteEstimationOptions(PaperOptions):
     error_scale: ArrayLike | None = None
     """Divisor of the observed errors: one number, or one per source. By default about the optimal
     threshold of a random walk at a price of 5, or at the rate that the tokens allow."""
+    filter: Annotated[str, _FILTERS] = "symmetric"
+    """Estimator of the centre. ``"symmetric"`` repeats its prediction in silence. ``"truncated"``
+    uses the silence of the policy ``trigger``; other policies are refused."""
+    trigger: Trigger | None = None
+    """Policy whose silence ``filter="truncated"`` uses."""
+    trigger_threshold: ArrayLike | None = None
+    """Threshold or reportable change of the policy ``trigger``: one number, or one per source."""
     tokens: Tokens = "unlimited"
     token_rate: float = 0.25
     token_capacity: float = 5.0
@@ -79,7 +91,12 @@ class RemoteEstimationOptions(PaperOptions):
     horizon: int = 200
     cost_weight: float | Literal["random"] = 5.0
 
+    def nominal(self) -> RemoteEstimationOptions:
+        """Return the options whose simulation scales the reward, equal for all filters."""
+        return replace(super().nominal(), filter="symmetric", trigger=None, trigger_threshold=None)
 
+
+_WHERE = "with filter='symmetric'"
 _USUAL_PRICE = 5.0  # of a packet, in squared deviations of the noise
 _DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
 _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
@@ -107,6 +124,7 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
         error_scale=_error_scale(options, deviation),
         state_weights=weights,
         nature=_nature(options, coefficient),
+        silence=_silence(options, sensors),
     )
     return Scenario(
         options,
@@ -114,7 +132,20 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
         weights,
         nodes_have_memory=True,  # a source's value is all that there is to know of it
         no_estimates="a packet carries the source's value",
+        policy_defaults={} if system.silence is None else system.silence.policy_defaults,
+        required_policy=options.trigger,
     )
+
+
+def _silence(options: RemoteEstimationOptions, sensors: int) -> Silence | None:
+    """Return the silence that the estimator uses."""
+    validation.choice("filter", options.filter, _FILTERS)
+    if options.filter == "truncated":
+        return Silence.create(options.trigger, options.trigger_threshold, sensors, 1)
+    for name in ("trigger", "trigger_threshold"):
+        if getattr(options, name) is not None:
+            raise validation.refusal(name, getattr(options, name), "left out", _WHERE)
+    return None
 
 
 def _nature(options: RemoteEstimationOptions, coefficient: Array) -> Nature:

@@ -24,6 +24,7 @@ from fusion_gym.core.system import (
     numbered,
 )
 from fusion_gym.namespace import namespace
+from fusion_gym.systems.silence import Silence
 
 _RANGE = 5.0  # scaled errors are clipped here
 _FLOOR = 1e-12  # variance after a delivery, in process variances: zero could not be inverted
@@ -37,7 +38,8 @@ class RemoteEstimationState:
     ``prior_variance`` and ``variance`` (n, N), of the errors by age · ``held`` (n, N), the last
     delivered value · ``age`` (n, N), steps since then · ``channel`` (n, N), the state S(t-1) that
     was fed back · ``next_channel`` (n, N), S(t) · ``lost`` (n, N) bool, the loss of a packet sent
-    now · ``departure`` (4, N) of the truth from the model, if any.
+    now · ``departure`` (4, N) of the truth from the model, if any · ``possible`` (n, N) bool, the
+    sensors that the network would have granted.
     """
 
     truth: Array
@@ -51,6 +53,7 @@ class RemoteEstimationState:
     next_channel: NDArray[np.int64]
     lost: NDArray[np.bool_]
     departure: Array | None = None
+    possible: NDArray[np.bool_] | None = None
 
 
 SIGNALS = (
@@ -73,16 +76,27 @@ SIGNALS = (
 
 @dataclass(frozen=True)
 class RemoteEstimationSystem(System[RemoteEstimationState]):
-    """n independent sources x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and the optimal estimator.
+    r"""n independent sources x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and the optimal estimator.
 
     x̂ = x on a delivery and a x̂ otherwise, which is optimal under every rule that is symmetric in
     the error. Silence then carries no information on the error's sign; the variances by age ignore
-    its information on the error's size. The centre feeds back the channel's state and the arrival
-    of a packet, so that the sensor knows x̂.
+    its information on the error's size. With ``silence`` both use it. The centre feeds back the
+    channel's state and the arrival of a packet, so that the sensor knows x̂.
 
     Shapes: ``coefficient`` a, ``deviation`` σ, ``initial_deviation`` of x(0), ``error_scale`` that
     divides observed errors, and ``state_weights``: (n,). Where the truth departs by ``nature``, a
     source moves by c a, because I + c (a - I) would not change a random walk.
+
+    Equation:
+        $$
+        \text{delivered:}\quad \hat x^{+}=x,\quad P^{+}=0,\qquad
+        \text{silent:}\quad \hat x^{+}=a\,\hat x,\quad P^{+}=a^2P+\sigma^2
+        $$
+
+    Assumes: Gaussian noise, exact measurements, and a rule that is symmetric in the error.
+
+    Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
+    Markovian state", IEEE Trans. Automatic Control 65, 2020.
     """
 
     state_names: tuple[str, ...]
@@ -93,12 +107,13 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
     error_scale: Array
     state_weights: Array
     nature: Nature = AS_ASSUMED
+    silence: Silence | None = None
     signals = SIGNALS
 
     @property
     def numpy_only(self) -> str | None:
         """See :class:`System`."""
-        return None
+        return None if self.silence is None else "filter"
 
     @property
     def sensor_count(self) -> int:
@@ -120,7 +135,15 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         """See :class:`System`; without losses every packet arrives."""
         if capability == "arrival_probability":
             return self.channel.loses
+        if capability == "with_possible":
+            return self.silence is not None
         return super().offers(capability)
+
+    def with_possible(
+        self, state: RemoteEstimationState, possible: NDArray[np.bool_]
+    ) -> RemoteEstimationState:
+        """See :class:`System`."""
+        return replace(state, possible=possible)
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -193,13 +216,27 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         """Replace the centre's prediction where a granted packet arrives."""
         xp, arrived = namespace(granted, state.lost), granted & ~state.lost
         floor = _FLOOR * self.deviation[:, None] ** 2
+        estimate, variance = self._silent(state)
         return replace(
             state,
-            estimate=xp.where(arrived, state.truth, state.prior),
-            variance=xp.where(arrived, floor, state.prior_variance),
+            estimate=xp.where(arrived, state.truth, estimate),
+            variance=xp.where(arrived, floor, variance),
             held=xp.where(arrived, state.truth, state.held),
             age=xp.where(arrived, 0.0, state.age),
+            possible=None,
         )
+
+    def _silent(self, state: RemoteEstimationState) -> tuple[Array, Array]:
+        """Return estimate and variance (n, N) without a delivery."""
+        if self.silence is None:
+            return state.prior, state.prior_variance
+        failure = 1.0 - self._arrival_probability(state.channel)
+        if state.possible is not None:
+            failure = np.where(state.possible, failure, 1.0)
+        deviation = np.sqrt(np.maximum(state.prior_variance, _FLOOR * self.deviation[:, None] ** 2))
+        shift = self.silence.middle(state.held, state.prior) - state.prior
+        mean, variance = self.silence.moments(self.silence.threshold, shift, deviation, failure)
+        return state.prior + deviation * mean, deviation**2 * variance
 
     def read(
         self, state: RemoteEstimationState
@@ -217,9 +254,9 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
             "channel_state": state.channel,
             "prior_mean": state.prior,
             "prior_covariance": lambda: _diagonal(state.prior_variance),
-            "silent_variance": lambda: self._weighted(state.prior_variance).sum(0),
+            "silent_variance": lambda: self._weighted(self._silent(state)[1]).sum(0),
             "variance_reduction": lambda: (
-                self._weighted(state.prior_variance) * self._arrival_probability(state.channel)
+                self._weighted(self._silent(state)[1]) * self._arrival_probability(state.channel)
             ),
         }
 

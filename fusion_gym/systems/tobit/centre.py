@@ -50,10 +50,13 @@ class CentrePrediction(NamedTuple):
 class Centre(Protocol):
     """The interface of nodes and centre."""
 
+    filter: Any
+
     @property
     def sensors(self) -> CensoredSensors:
         """The sensors."""
-        ...
+        sensors: CensoredSensors = self.filter.sensors
+        return sensors
 
     @property
     def predictable(self) -> bool:
@@ -161,11 +164,6 @@ class NodeCentre(Centre):
 
     filter: NodeFilter
     feedback: Feedback
-
-    @property
-    def sensors(self) -> CensoredSensors:
-        """The sensors."""
-        return self.filter.sensors
 
     @property
     def predictable(self) -> bool:
@@ -340,11 +338,6 @@ class SequentialCentre(Centre):
     """A centre without nodes, which processes the deliveries one after another."""
 
     filter: AssumedDensityFilter
-
-    @property
-    def sensors(self) -> CensoredSensors:
-        """The sensors."""
-        return self.filter.sensors
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` have no effect."""

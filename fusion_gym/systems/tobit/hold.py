@@ -48,11 +48,6 @@ class HoldCentre(Centre):
     plant: LinearPlant
 
     @property
-    def sensors(self) -> CensoredSensors:
-        """The sensors."""
-        return self.filter.sensors
-
-    @property
     def numpy_only(self) -> str | None:
         """See :class:`Centre`."""
         return "filter"

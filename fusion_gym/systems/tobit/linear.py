@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, plain_options
 from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.silence import Trigger
 from fusion_gym.systems.tobit.hold import HoldCentre, hold_centre
 from fusion_gym.systems.tobit.joint import JointCentre, joint_centre
 from fusion_gym.systems.tobit.linear_sensors import linear_sensors
@@ -28,7 +29,7 @@ from fusion_gym.systems.tobit.options import (
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
-from fusion_gym.systems.tobit.truncated import TRIGGERS, TruncatedCentre, truncated_centre
+from fusion_gym.systems.tobit.truncated import TruncatedCentre, truncated_centre
 
 _FILTERS = {
     "kalman": FILTERS["kalman"],
@@ -122,7 +123,7 @@ class LinearFusionOptions(FeedbackOptions):
     is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the least-squares state
     of the last delivered values, without a filter. ``"truncated"`` is one Kalman filter at the
     centre that uses the silence of the policy ``trigger``; other policies are refused."""
-    trigger: Literal["innovation_threshold", "report_on_change", "send_on_delta"] | None = None
+    trigger: Trigger | None = None
     """Policy whose silence ``filter="truncated"`` uses."""
     trigger_threshold: ArrayLike | None = None
     """Threshold or reportable change of the policy ``trigger``: one number, or one per sensor, in
@@ -160,8 +161,8 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     holds = choice.filter == "hold"
     kind = "kalman" if holds and choice.memory_filter is None else choice.memory_filter
     defaults = stochastic_defaults(choice)
-    if choice.trigger is not None:
-        defaults[choice.trigger] = {TRIGGERS[choice.trigger]: _plain(choice.trigger_threshold)}
+    if isinstance(centre, TruncatedCentre):
+        defaults |= centre.silence.policy_defaults
     return Scenario(
         choice,
         system,
@@ -171,12 +172,6 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
         no_estimates=_HELD if holds else None,
         required_policy=choice.trigger,
     )
-
-
-def _plain(value: Any) -> Any:
-    """Return a threshold as a number or a tuple, as policies take it."""
-    plain = plain_options(value)
-    return tuple(plain) if isinstance(plain, list) else plain
 
 
 def _plant(options: LinearFusionOptions) -> LinearPlant:

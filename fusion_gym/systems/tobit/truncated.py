@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fusion_gym import linalg, validation
+from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.errors import refusal
-from fusion_gym.gaussian import interval_moments
+from fusion_gym.systems.silence import Silence
 from fusion_gym.systems.tobit.centre import (
     Centre,
     CentrePrediction,
@@ -22,13 +22,6 @@ from fusion_gym.systems.tobit.centre import (
 from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.options import refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-
-# Parameter of each trigger that bounds a silent measurement.
-TRIGGERS = {
-    "innovation_threshold": "threshold",
-    "report_on_change": "reportable_change",
-    "send_on_delta": "threshold",
-}
 
 
 @dataclass(frozen=True)
@@ -50,22 +43,18 @@ class TruncatedCentre(FederatedCentre):
         P^{+}=P-\frac{P C^{\mathsf T}C P}{S}\,(1-\mathrm{var}\,z)
         $$
 
-        z is a standard normal truncated to the interval. Its centre c is the last delivered value
-        under ``send_on_delta`` and ``report_on_change``, and the predicted measurement under
-        ``innovation_threshold``. θ is ``trigger_threshold``. A silent sensor whose request the
-        tokens would not have paid for gives no information.
+        z is a standard normal truncated to the interval (c - θ, c + θ) of
+        :class:`~fusion_gym.systems.silence.Silence`. A silent sensor whose request the tokens would
+        not have paid for gives no information.
 
     Assumes: a linear plant, Gaussian noises, uncensored sensors, the trigger of the option
     ``trigger`` with this threshold and without a min_interval.
 
     Source: J. Sijs and M. Lazar, "Event based state estimation with time synchronous updates",
-    IEEE Trans. Automatic Control 57, 2012; J. Wu, Q.-S. Jia, K. H. Johansson and L. Shi,
-    "Event-based sensor data scheduling: trade-off between communication rate and estimation
-    quality", IEEE Trans. Automatic Control 58, 2013.
+    IEEE Trans. Automatic Control 57, 2012.
     """
 
-    trigger: str
-    threshold: Array
+    silence: Silence
 
     local_means = Centre.local_means
 
@@ -99,10 +88,8 @@ class TruncatedCentre(FederatedCentre):
         """See :class:`Centre`."""
         mean, covariance = super().update(prior, prediction, measurement, granted)
         silent = ~granted if prediction.possible is None else ~granted & prediction.possible
-        silent = silent & (self.threshold > 0.0)
-        middle = prediction.held
-        if self.trigger == "innovation_threshold":
-            middle = prediction.expectation.value
+        silent = silent & (self.silence.threshold > 0.0)
+        middle = self.silence.middle(prediction.held, prediction.expectation.value)
         for sensor in np.flatnonzero(silent.any(-1)):
             for channel in range(self.sensors.size):
                 row = self.sensors.measurement_matrix[sensor, channel]
@@ -110,12 +97,12 @@ class TruncatedCentre(FederatedCentre):
                 variance = (row * across).sum(0) + self.sensors.variance[sensor, channel]
                 deviation = np.sqrt(variance)
                 shift = middle[sensor, channel] - (row * mean).sum(0)
-                width = np.maximum(self.threshold[sensor], 1e-300)
-                low, high = (shift - width) / deviation, (shift + width) / deviation
-                moments = interval_moments(low, np.maximum(high, np.nextafter(low, np.inf)))
+                first, second = self.silence.moments(
+                    self.silence.threshold[sensor], shift, deviation, 0.0
+                )
                 gain = np.where(silent[sensor], across / deviation, 0.0)
-                mean = mean + gain * moments.mean
-                covariance = covariance - (1.0 - moments.variance) * linalg.outer(gain, gain)
+                mean = mean + gain * first
+                covariance = covariance - (1.0 - second) * linalg.outer(gain, gain)
         return mean, covariance
 
     def variances(
@@ -147,17 +134,11 @@ def truncated_centre(options: Any, sensors: CensoredSensors) -> TruncatedCentre:
             missing or measures several channels together, or a threshold that is not allowed.
     """
     refuse_fusion(options, "truncated")
-    where = "with filter='truncated'"
     if not sensors.unlimited:
         allowed = "'kalman', 'tobit' or 'adf' with censored sensors"
         raise refusal("filter", "truncated", allowed)
-    if options.trigger is None or options.trigger_threshold is None:
-        name = "trigger" if options.trigger is None else "trigger_threshold"
-        raise refusal(name, None, "the policy whose silence the filter reads", where)
-    if sensors.size > 1 and options.trigger != "report_on_change":
-        raise refusal("trigger", options.trigger, "'report_on_change'", "for several channels")
-    threshold = validation.not_negative(
-        "trigger_threshold", options.trigger_threshold, (sensors.count,)
+    silence = Silence.create(
+        options.trigger, options.trigger_threshold, sensors.count, sensors.size
     )
     feedback = Feedback.in_full(sensors.count)
-    return TruncatedCentre(KalmanFilter(sensors), feedback, options.trigger, threshold[:, None])
+    return TruncatedCentre(KalmanFilter(sensors), feedback, silence)
