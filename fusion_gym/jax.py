@@ -25,6 +25,7 @@ from fusion_gym.core.runs import Branch, Outcome, Position
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.vector import step_infos
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.errors import refusal
 from fusion_gym.importing import require
@@ -174,16 +175,7 @@ class FunctionalEnv:
 
         moved = jax.lax.cond(ended.any(), renew, lambda moved: moved, moved)
         terminated = ended & task.clock
-        info = {
-            "cost": outcome.cost,
-            "reward_error": outcome.reward_error,
-            "reward_cost": outcome.reward_communication,
-            "granted": outcome.granted.T,
-            "denied": (outcome.requested & ~outcome.granted).T,
-            "squared_error": outcome.squared_error.T,
-            "diverged": outcome.diverged,
-            "final_observation": last,
-        }
+        info = step_infos(outcome) | {"final_observation": last}
         results = outcome.reward, terminated, ended & ~terminated, info
         return self._runs(task, moved).observe(), moved, results
 
@@ -319,7 +311,7 @@ def _normals(keys: Any, channels: int) -> Any:
 def _for_one_run(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of N runs as one of a single run, which ``jax.vmap`` turns back.
 
-    Without this the batch axis were the first one, and a step several times slower.
+    Otherwise the batch axis would be the first one, and a step several times slower.
 
     Args:
         function: From parameters, arrays (N, …) and a state (…, N) to a tuple of arrays (N, …) and

@@ -54,10 +54,10 @@ class Result(NamedTuple):
 
 
 class CompiledStep:
-    """A step and its observation, with one array of float64 in and two out.
+    """A step and its observation, with few arrays of float64 in and out.
 
-    JAX takes longer to pass many arrays than to compute a step of one run, so a position is one
-    array (entries, N), and NumPy's positions have views of it.
+    JAX takes longer to pass many arrays than to compute a step of one run, so the entries of a
+    position are rows of few arrays, of which NumPy's positions have views.
 
     Args:
         branch: Function that returns the runs at a position, which JAX traces.
@@ -67,7 +67,7 @@ class CompiledStep:
         self._branch, self._program = branch, jax.jit(self._trace)
 
     def pack(self, position: Position) -> Any:
-        """Return the rows (entries, N) of a position."""
+        """Return the rows of a position, a list of arrays (rows, N)."""
         register_state(position.state)
         self._position = _Rows(position)
         return self._position.pack(np, position)

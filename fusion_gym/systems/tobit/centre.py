@@ -107,8 +107,19 @@ class Centre(Protocol):
     def variances(
         self, prior: Gaussian, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
-        """Return a silent step's weighted fused trace (N,), and its reductions (sensors, N)."""
-        ...
+        """Return a silent step's weighted fused trace (N,), and its reductions (sensors, N).
+
+        A packet holds the expected measurement.
+        """
+        count, runs = self.sensors.count, prior[0].shape[-1]
+
+        def trace(granted: Packets) -> Array:
+            packets = np.broadcast_to(granted[:, None], (count, runs))
+            posterior = self.update(prior, prediction, prediction.expectation.value, packets)
+            return linalg.weighted_trace(posterior[1], weights)
+
+        silent = trace(np.zeros(count, dtype=np.bool_))
+        return silent, silent - np.stack([trace(own) for own in np.eye(count, dtype=np.bool_)])
 
 
 @dataclass(frozen=True)

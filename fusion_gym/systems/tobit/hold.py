@@ -99,19 +99,6 @@ class HoldCentre(Centre):
         mean = linalg.matvec(self.inverse, held.reshape(-1, held.shape[-1]))
         return mean, self._covariance(self._delivered(prediction.moment, granted))
 
-    def variances(
-        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`."""
-        silent = linalg.weighted_trace(prior[1], weights)
-        single = [
-            linalg.weighted_trace(
-                self._covariance(self._delivered(prediction.moment, sensor)), weights
-            )
-            for sensor in np.eye(self.sensors.count, dtype=np.bool_)[..., None]
-        ]
-        return silent, silent - np.stack(single)
-
     def _start(self, state: Any) -> Gaussian:
         runs = state.mean.shape[-1]
         mean, covariance = self.plant.initial_mean, self.plant.initial_covariance

@@ -57,6 +57,7 @@ class TruncatedCentre(FederatedCentre):
     silence: Silence
 
     local_means = Centre.local_means
+    variances = Centre.variances
 
     @property
     def predictable(self) -> bool:
@@ -104,22 +105,6 @@ class TruncatedCentre(FederatedCentre):
                 mean = mean + gain * first
                 covariance = covariance - (1.0 - second) * linalg.outer(gain, gain)
         return mean, covariance
-
-    def variances(
-        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`; packets that hold the expected measurement."""
-        expected, runs = prediction.expectation.value, prior[0].shape[-1]
-
-        def trace(granted: Packets) -> Array:
-            whole = np.broadcast_to(granted[:, None], (self.sensors.count, runs))
-            return linalg.weighted_trace(
-                self.update(prior, prediction, expected, whole)[1], weights
-            )
-
-        single = np.stack([trace(own) for own in np.eye(self.sensors.count, dtype=np.bool_)])
-        silent = trace(np.zeros(self.sensors.count, dtype=np.bool_))
-        return silent, silent - single
 
 
 def truncated_centre(options: Any, sensors: CensoredSensors) -> TruncatedCentre:
