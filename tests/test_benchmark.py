@@ -166,13 +166,13 @@ def test_prices_are_slopes_of_the_front(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_all_tasks_and_rules_of_the_benchmark_exist() -> None:
     suite = load_suite()
-    assert len(suite.settings) == 7
+    assert len(suite.settings) == 8
     for setting in suite.settings:
         for name in CLASSES:
-            task = setting.task(name)
             own = rules.rules_of(setting, name, suite.rules, setting.has_memory(name))
             assert len(own) >= 4
             for rule in own:
+                task = setting.task(name, case=rule.case)
                 policy = make_policy(rule.policy.format(value=rule.ends[1]), task)
                 assert covers(knowledge_of(setting, name), policy.knowledge)
             for case in (None, *suite.cases_of(setting)):

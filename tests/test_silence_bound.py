@@ -23,7 +23,7 @@ from fusion_gym.solvers.silence import (
     simulate,
     solve_silence,
 )
-from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, spread_values
+from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, margins, spread_values
 from fusion_gym.solvers.silence.survival import Survival
 from fusion_gym.solvers.single import solve_finite
 from fusion_gym.solvers.source import SourceProblem
@@ -191,7 +191,10 @@ def test_hats_keep_the_mean_and_widen_the_noise(deviation: float) -> None:
     assert weights[0] + 2.0 * weights[1:].sum() == pytest.approx(1.0, abs=1e-13)
     variance = 2.0 * weights @ np.arange(len(weights)) ** 2
     assert deviation**2 <= variance < deviation**2 + 0.25
-    values, added = spread_values(np.array([0.0, -1.0, 0.0]), np.array([deviation]))
+    everywhere = 1 + margins(np.array([deviation]))
+    single = np.array([0.0, -1.0, 0.0]), np.array([deviation])
+    values, added = spread_values(*single, everywhere)
+    assert (spread_values(*single, everywhere - 2)[0] == values[2:-2]).all()
     assert variance == pytest.approx(deviation**2 + added)
     assert -values.sum() == pytest.approx(1.0, abs=1e-12)
     # A concave function has its mean bounded from below: here that of -|X|.

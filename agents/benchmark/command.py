@@ -1,4 +1,4 @@
-"""The benchmark: rules and agents of three classes in seven settings, at equal price.
+"""The benchmark: rules and agents of three classes in eight settings, at equal price.
 
     python -m agents.benchmark [--quick] [--settings NAME …] [--workers 2]
     python -m agents.benchmark --policy 'value_of_information:price={price}' --class scheduler
@@ -40,7 +40,7 @@ from fusion_gym.validation import refusal
 
 @dataclass(frozen=True)
 class Benchmark(Long):
-    """The benchmark: rules and agents of three classes in seven settings, at equal price."""
+    """The benchmark: rules and agents of three classes in eight settings, at equal price."""
 
     program = "python -m agents.benchmark"
 

@@ -167,8 +167,9 @@ def test_all(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
     jobs: list[TestJob] = []
     for item in classes:
         for kind, policies in policies_of(item):
+            case = item.setting.trigger.case if kind == "trigger" else None
             places.append((item, kind, True))
-            jobs.append(item.test(policies, suite.episodes))
+            jobs.append(item.test(policies, suite.episodes, case=case))
             if kind in (REFERENCE, "agent"):
                 places.append((item, kind, False))
                 jobs.append(item.test(policies, suite.validation_episodes, VALIDATION_SEED))

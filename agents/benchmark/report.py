@@ -34,7 +34,7 @@ GAIN = 0.01  # a difference that the sentences name
 README = Path("README.md")
 TITLES = {"centre": "fusion centre", "local": "local sensors", "scheduler": "centralised scheduler"}
 LINES = {  # kind: label, colour, marker
-    "trigger": ("the paper's trigger, scaled", "tab:gray", "v"),
+    "trigger": ("own trigger, scaled", "tab:gray", "v"),
     "threshold": ("best rule with one threshold", "tab:blue", "o"),
     "rule": ("searched rule", "black", "s"),
     "agent": ("agents", "tab:orange", "^"),
@@ -114,7 +114,7 @@ def headline_text(titles: dict[str, str], rows: Sequence[ClassRow]) -> str:
         for kind in ("trigger", "threshold", "agent")
     }
     text = (
-        "Negative: the agent is better. In the median class the paper's trigger, scaled, costs "
+        "Negative: the agent is better. In the median class the own trigger, scaled, costs "
         f"{medians['trigger']:+.1%} over the searched rule, the best rule with one threshold "
         f"{medians['threshold']:+.1%}, and an agent {medians['agent']:+.1%}."
     )
@@ -160,8 +160,8 @@ def sentences(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> list[str]
     counted = [point for point in points if point.kind == "agent" and point.discovery]
     fewer = sum(point.difference < 0 for point in counted)
     return [
-        f"The papers' triggers, scaled by one number, cost {mean('trigger')} more than the "
-        "searched rule.",
+        "The settings' own triggers (the papers', and what devices run), scaled by one number, "
+        f"cost {mean('trigger')} more than the searched rule.",
         f"The best rule with one threshold, tuned at each price, costs {mean('threshold')} more.",
         f"Agents cost {mean('agent')} more; they are cheaper at {fewer} points and dearer at "
         f"{len(counted) - fewer}, with a false discovery rate of 5 %.",

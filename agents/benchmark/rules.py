@@ -12,7 +12,14 @@ from typing import ClassVar
 import numpy as np
 
 from agents.benchmark.jobs import Job
-from agents.benchmark.settings import TUNING_SEED, ClassName, Setting, ThresholdRule, knowledge_of
+from agents.benchmark.settings import (
+    TUNING_SEED,
+    Case,
+    ClassName,
+    Setting,
+    ThresholdRule,
+    knowledge_of,
+)
 from fusion_gym.arrays import Array
 from fusion_gym.core.scale import prices_at
 from fusion_gym.core.system import covers
@@ -55,6 +62,7 @@ class TunedRule:
     price: float
     policy: str
     cost: float
+    case: Case | None
 
 
 @dataclass(frozen=True)
@@ -65,8 +73,11 @@ class SweepResult:
     tuned: tuple[TunedRule, ...]
 
     def best(self, price: float, rule: str | None = None) -> TunedRule:
-        """Return the best of all rules at a price, or the best threshold of one rule."""
-        own = (t for t in self.tuned if t.price == price and rule in (None, t.rule))
+        """Return the best rule with the setting's options, or the best threshold of one rule."""
+        own = (
+            t for t in self.tuned
+            if t.price == price and (t.rule == rule if rule else t.case is None)
+        )  # fmt: skip
         return min(own, key=lambda item: item.cost)
 
 
@@ -83,20 +94,23 @@ class SearchJob(Job):
 
 def run_sweep(job: SweepJob) -> SweepResult:
     """Tune every rule of a class on the tuning episodes, and choose missing prices."""
-    task = job.setting.task(job.name, job.memory)
+    tasks = {rule: job.setting.task(job.name, job.memory, rule.case) for rule in job.rules}
     trials = {
         rule: _try(task, rule, np.geomspace(*rule.ends, COUNT), job.episodes[0])
-        for rule in job.rules
+        for rule, task in tasks.items()
     }
-    prices = job.prices or _prices(task, list(itertools.chain(*trials.values())), job)
+    usual = {rule: own for rule, own in trials.items() if rule.case is None}
+    task = job.setting.task(job.name, job.memory)
+    prices = job.prices or _prices(task, list(itertools.chain(*usual.values())), job)
     tuned = []
     for price in prices:
         best = {rule: min(own, key=lambda t: t.cost(price)) for rule, own in trials.items()}
-        least = min(trial.cost(price) for trial in best.values())
+        least = min(best[rule].cost(price) for rule in usual)
         for rule, trial in best.items():
             if trial.cost(price) <= NEAR * least or rule == job.setting.trigger:
-                trial = _finer(task, job, rule, trials[rule], trial, price)
-            tuned.append(TunedRule(rule.policy, price, trial.policy, trial.cost(price)))
+                trial = _finer(tasks[rule], job, rule, trials[rule], trial, price)
+            cost = trial.cost(price)
+            tuned.append(TunedRule(rule.policy, price, trial.policy, cost, rule.case))
     return SweepResult(prices, tuple(tuned))
 
 
@@ -104,10 +118,11 @@ def rules_of(
     setting: Setting, name: ClassName, rules: Sequence[ThresholdRule], memory: bool
 ) -> tuple[ThresholdRule, ...]:
     """Return the rules whose declared knowledge the class covers."""
-    task, knower = setting.task(name, memory), knowledge_of(setting, name)
+    knower = knowledge_of(setting, name)
     result = []
     for rule in dict.fromkeys((setting.trigger, *setting.more_rules, *rules)):
         try:
+            task = setting.task(name, memory, rule.case)
             policy = make_policy(rule.policy.format(value=rule.ends[0]), task)
         except ConfigurationError:  # a rule of another family
             continue

@@ -26,13 +26,6 @@ TEST_SEED, VALIDATION_SEED, TUNING_SEED = 0, 800_000_000, 600_000_000
 Options = dict[str, Any]
 
 
-class ThresholdRule(Strict):
-    """A rule with one threshold, ``{value}`` in its text, between two ends."""
-
-    policy: str
-    ends: tuple[Rate, Rate]
-
-
 class Case(Strict):
     """Other options of a setting, and a factor of its token rate."""
 
@@ -40,9 +33,23 @@ class Case(Strict):
     options: Options = pydantic.Field(default_factory=dict)
     tokens: Rate = 1.0
 
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+
+class ThresholdRule(Strict):
+    """A rule with one threshold, ``{value}`` in its text, between two ends.
+
+    With a case the rule runs with other options than the setting's, such as another filter.
+    """
+
+    policy: str
+    ends: tuple[Rate, Rate]
+    case: Case | None = None
+
 
 class Setting(Strict):
-    """An environment with options, its paper's trigger, and the length of its trainings.
+    """An environment with options, its own trigger, and the length of its trainings.
 
     ``optimum`` is a policy with ``{price}``.
     """

@@ -11,6 +11,7 @@ from fusion_gym.solvers.silence.lattice import (
     Coordinates,
     extents,
     interpolated,
+    margins,
     nodes,
     spread_values,
 )
@@ -71,14 +72,17 @@ class _Expectation:
     """
 
     def __init__(self, stage: Stage, price: float) -> None:
-        deviations = np.sqrt(stage.coordinates.variance) / stage.step
-        gain, added = spread_values(stage.gain, deviations)
         self.stage = stage
-        self.values = stage.ceiling + gain - stage.step**2 * added
+        self.deviations = np.sqrt(stage.coordinates.variance) / stage.step
         self.far = stage.ceiling - _TAIL * price
-        self.half = (np.array(gain.shape) - 1) // 2
-        self.middle = float(self.values[tuple(self.half)])
+        self.half = stage.half + margins(self.deviations)
+        self.middle = float(self.values(0 * self.half).item())
         self.rise = max(self.middle - stage.floor, 0.0) + _TAIL * price
+
+    def values(self, reach: NDArray[np.int64]) -> Array:
+        """Return the expectations at so many points on each side of the middle, by axis (n,)."""
+        gain, added = spread_values(self.stage.gain, self.deviations, reach)
+        return self.stage.ceiling + gain - self.stage.step**2 * added
 
     def within(self, deviations: float) -> Array:
         """Return semi-axes (B, n) of ellipsoids, each around all points near the silent set.
@@ -98,7 +102,8 @@ class _Expectation:
         near = np.ones(points.shape[1], dtype=np.bool_)
         for place, half in zip(places, self.half, strict=True):
             near &= np.abs(place) <= half
-        results, parts = interpolated(self.values, places[:, near])
+        reach = np.ceil(np.abs(places[:, near]).max(1, initial=0.0)).astype(np.int64)
+        results, parts = interpolated(self.values(reach), places[:, near])
         result = np.full(points.shape[1], self.far)
         result[near] = results - self.stage.step**2 * parts
         return result

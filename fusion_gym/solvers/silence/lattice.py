@@ -71,25 +71,35 @@ def hat_weights(deviation: float, count: int) -> Array:
     return np.concatenate([[first], above[:-2] - 2.0 * above[1:-1] + above[2:]])
 
 
-def spread_values(values: Array, deviations: Array) -> tuple[Array, float]:
-    """Return Σ of the hat weights times ``values`` on a larger lattice, and the added variance.
+def margins(deviations: Array) -> NDArray[np.int64]:
+    """Return the points (n,) that the noise adds on each side of a lattice."""
+    return np.where(deviations == 0.0, 1, np.ceil(REACH * deviations).astype(np.int64) + 2)
+
+
+def spread_values(
+    values: Array, deviations: Array, reach: NDArray[np.int64]
+) -> tuple[Array, float]:
+    """Return Σ of the hat weights times ``values`` around the middle, and the added variance.
 
     Deviations and the added variance, a sum over the axes, are in units of the lattice's step.
 
     Args:
         values: values (points along each axis), 0 outside.
         deviations: standard deviations of the noise (n,).
+        reach: points of the result on each side of the middle, by axis (n,).
     """
     added = 0.0
-    for axis, deviation in enumerate(deviations.tolist()):
+    for axis, (deviation, margin) in enumerate(zip(deviations, margins(deviations), strict=True)):
         if deviation == 0.0:
-            margin, weights = 1, np.array([1.0, 0.0])
+            weights = np.array([1.0, 0.0])
         else:
-            margin = int(np.ceil(REACH * deviation)) + 2
             weights = hat_weights(deviation, margin)
             added += float(2.0 * weights @ np.arange(margin + 1) ** 2) - deviation**2
         count = values.shape[axis]
-        gap = np.abs(np.arange(-margin, count + margin)[:, None] - np.arange(count))
+        middle = (count - 1) // 2
+        gap = np.abs(
+            np.arange(middle - reach[axis], middle + reach[axis] + 1)[:, None] - np.arange(count)
+        )
         matrix = np.where(gap <= margin, weights[np.minimum(gap, margin)], 0.0)
         values = np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
     return values, added
