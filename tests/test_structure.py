@@ -21,6 +21,7 @@ FLOORS = {
     "version": 0,
     "yaml_text": 0,
     "fusion": 1,
+    "recordings": 1,
     "core": 2,
     "systems": 3,
     "envs": 4,

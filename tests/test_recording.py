@@ -1,0 +1,226 @@
+"""Logs of sensors: what a data card says, and what is refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from fusion_gym.recordings import ChannelCard, Recording
+from fusion_gym.validation import ConfigurationError
+from tests.command_runs import refusal, succeed
+
+LOGS = Path(__file__).parent.parent / "examples" / "recordings"
+
+
+def log(rows: int = 60, **columns: object) -> pd.DataFrame:
+    """Three channels of noise, or other columns, every ten minutes."""
+    draw = np.random.default_rng(0)
+    times = pd.date_range("2026-03-01", periods=rows, freq="10min").astype(str)
+    table = pd.DataFrame({"time": times, **{f"{c} [m]": draw.normal(size=rows) for c in "abc"}})
+    return table.assign(**columns)
+
+
+def read(table: pd.DataFrame | str | bytes, folder: Path, **options: object) -> Recording:
+    path = folder / "log.csv"
+    if isinstance(table, pd.DataFrame):
+        table.to_csv(path, index=False, **options)
+    else:
+        path.write_bytes(table if isinstance(table, bytes) else table.encode())
+    return Recording.read(path)
+
+
+def card(recording: Recording, name: str) -> ChannelCard:
+    return next(row for row in recording.card if row.channel.name == name)
+
+
+def with_cell(row: int, column: int, value: object, rows: int = 60) -> pd.DataFrame:
+    table = log(rows).astype(object)
+    table.iat[row, column] = value
+    return table
+
+
+def changed(values: Callable[[np.ndarray], np.ndarray], rows: int = 600) -> pd.DataFrame:
+    """A log whose channel a is a function of its noise."""
+    table = log(rows)
+    return table.assign(**{"a [m]": values(table["a [m]"].to_numpy())})
+
+
+def shuffled(table: pd.DataFrame) -> pd.DataFrame:
+    return table.sample(frac=1.0, random_state=0)
+
+
+TEXT = log().to_csv(index=False)
+REFUSED = {
+    "an empty file": ("", "it must be a CSV file"),
+    "a picture": (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "it must be a CSV file"),
+    "rows of different lengths": (TEXT + "2026-03-02,1,2,3,4,5,6\n", "it must be a CSV file"),
+    "heads without rows": (TEXT.splitlines()[0], "0 of its 0 rows begin with a time"),
+    "one row": (log(1), "1 of its 1 rows begin with a time, and at least 20"),
+    "nineteen rows": (log(19), "19 of its 19 rows begin with a time"),
+    "no channel": (log()[["time"]], "its channels are []"),
+    "no column of times": (log().drop(columns="time"), "0 of its 60 rows begin with a time"),
+    "times in words": (log(time="yesterday"), "0 of its 60 rows begin with a time"),
+    "years beyond pandas": (log(time=1e15), "0 of its 60 rows begin with a time"),
+    "half the times lost": (
+        log(time=["2026-01-01", *["?"] * 59]),
+        "1 of its 60 rows begin with a time",
+    ),
+    "one time for all": (log(time="2026-01-01 10:00"), "all its rows have the same time"),
+    "a clock that jumps to 1970": (with_cell(0, 0, "1970-01-01 00:00:00"), "look for a wrong time"),
+    "a clock that jumps to 2199": (with_cell(59, 0, "2199-01-01 00:00:00"), "look for a wrong"),
+    "two channels of one name": (
+        TEXT.replace("b [m]", "a [K]"),
+        "its channels are ['a', 'a', 'c']",
+    ),
+    "a channel of text": (log(d="on"), "its channel 'd' has no number"),
+    "a channel of gaps": (log(d=np.nan), "its channel 'd' has no number"),
+    "a channel of infinities": (log(d=np.inf), "its channel 'd' has no number"),
+    "an open bracket": (TEXT.replace("b [m]", "b [m"), "the head 'b [m' must be a name"),
+    "limits in words": (TEXT.replace("b [m]", "b [m] ..high"), "the head 'b [m] ..high' must be"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_log_that_is_none_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    table, message = REFUSED[name]
+    with pytest.raises(ConfigurationError, match=r"^recording = ") as error:
+        read(table, tmp_path)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+REMARKED = {
+    "unsorted": (shuffled(log()), "times before the row above: sorted"),
+    "a clock set back": (
+        log(time=pd.concat([log()["time"][:30], log()["time"][24:54]]).to_list()),
+        "6 rows at the time of another",
+    ),
+    "times of two precisions": (with_cell(3, 0, "2026-03-01 00:31"), "1 times between"),
+    "a word for no reading": (with_cell(3, 1, "off"), "1 cells without a finite number"),
+    "rows twice": (pd.concat([log(), log()]), "60 rows at the time of another"),
+    "rows beside the even times": (with_cell(7, 0, "2026-03-01 01:14:00"), "1 times between"),
+    "text in a cell": (with_cell(3, 1, "ERR"), "1 cells without a finite number"),
+    "infinity in a cell": (with_cell(3, 1, "inf"), "1 cells without a finite number"),
+    "a row without a time": (with_cell(3, 0, ""), "1 rows without a time: left out"),
+    "a row with a broken time": (with_cell(3, 0, "2026-13-45"), "1 rows without a time"),
+}
+
+
+@pytest.mark.parametrize("name", REMARKED)
+def test_what_is_changed_is_said(name: str, tmp_path: Path) -> None:
+    table, remark = REMARKED[name]
+    recording = read(table, tmp_path)
+    assert any(remark in line for line in recording.remarks), recording.remarks
+    assert recording.values.index.is_monotonic_increasing
+    assert recording.interval == pd.Timedelta("10min")
+
+
+CARDS: dict[str, tuple[pd.DataFrame, Callable[[ChannelCard], bool]]] = {
+    "constant": (changed(lambda a: 0 * a), lambda c: c.fault == "constant"),
+    "stuck": (
+        changed(lambda a: np.where(np.arange(600) > 200, 1.0, a)), lambda c: c.fault == "stuck"
+    ),
+    "saturated": (
+        changed(lambda a: np.minimum(a, 1.0)),
+        lambda c: c.channel.high == 1.0 and 0.1 < c.saturated < 0.2,
+    ),
+    "coarse": (changed(lambda a: np.round(a * 2) / 2), lambda c: c.resolution == 0.5),
+    "spikes": (
+        changed(lambda a: a + 100.0 * (np.arange(600) % 200 == 100)),
+        lambda c: c.spikes == 3 and not c.fault,
+    ),
+    "scattered gaps": (
+        changed(lambda a: np.where(np.arange(600) % 10 > 0, a, np.nan)),
+        lambda c: c.missing == pytest.approx(0.1) and c.every == 1,
+    ),
+    "another rate": (
+        changed(lambda a: np.where(np.arange(600) % 5 == 0, a, np.nan)), lambda c: c.every == 5
+    ),
+    "sound": (changed(lambda a: a), lambda c: not c.fault and not c.spikes and not c.saturated),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_the_card_says_what_a_channel_does(name: str, tmp_path: Path) -> None:
+    table, is_said = CARDS[name]
+    recording = read(table, tmp_path)
+    assert is_said(card(recording, "a")), card(recording, "a")
+    assert not card(recording, "b").fault
+
+
+@pytest.mark.parametrize("noise", [0.05, 3.0])
+def test_a_channel_that_disagrees_with_agreeing_peers_is_faulty(
+    noise: float, tmp_path: Path
+) -> None:
+    draw = np.random.default_rng(1)
+    common = draw.normal(size=(600, 1)).cumsum(0)
+    table = log(600)
+    table.iloc[:, 1:] = common + 0.1 * draw.normal(size=(600, 3))
+    table["d [m]"] = np.where(draw.random(600) < 0.3 * noise, 0.0, common[:, 0])
+    faults = {row.channel.name: row.fault for row in read(table, tmp_path).card}
+    assert faults.pop("d") == ("disagrees with its peers" if noise > 1.0 else "")
+    assert not any(faults.values())
+
+
+FORMATS: dict[str, Callable[[str], str | bytes]] = {
+    "semicolons and decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
+    "tabs": lambda text: text.replace(",", "\t"),
+    "a byte order mark": lambda text: b"\xef\xbb\xbf" + text.encode(),
+    "lines of Windows": lambda text: text.replace("\n", "\r\n"),
+    "time zones": lambda text: text.replace(":00,", ":00+02:00,"),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_formats_of_the_same_log_have_the_same_values(name: str, tmp_path: Path) -> None:
+    expected = read(TEXT, tmp_path)
+    recording = read(FORMATS[name](TEXT), tmp_path)
+    assert np.array_equal(recording.values, expected.values)
+    assert recording.channels == expected.channels
+
+
+def test_seconds_are_times(tmp_path: Path) -> None:
+    recording = read(log(time=np.arange(60) * 30 + 1.7e9), tmp_path)
+    assert recording.interval == pd.Timedelta("30s")
+    assert str(recording.values.index[0]) == "2023-11-14 22:13:20+00:00"
+
+
+def test_a_gap_leaves_steps_without_readings(tmp_path: Path) -> None:
+    recording = read(log().drop(index=range(20, 30)), tmp_path)
+    assert len(recording.values) == 60
+    assert recording.gaps == (1, pd.Timedelta("100min"))
+
+
+def test_the_mast_has_one_faulty_anemometer() -> None:
+    """As other measures have it: correlation .76 with the median of its peers."""
+    recording = Recording.read(LOGS / "mast.csv.xz")
+    faults = {row.channel.name: row.fault for row in recording.card if row.fault}
+    assert faults == {"Spd80mS": "disagrees with its peers"}
+    assert card(recording, "Spd80mS").agreement == pytest.approx(0.76, abs=0.005)
+    assert recording.gaps[1] == pytest.approx(pd.Timedelta("19.68 days"), abs=pd.Timedelta("15min"))
+    names = [channel.name for channel in recording.select().channels]
+    assert names == ["Spd80mN", "Spd60mN", "Spd60mS", "Spd40mN", "Spd40mS", "T2m"]
+
+
+def test_selected_channels_have_no_readings_at_their_limits() -> None:
+    recording = Recording.read(LOGS / "tanks.csv")
+    assert (recording.values["middle"] == 54.0).any()
+    chosen = recording.select(["middle"])
+    assert chosen.values["middle"].max() < 54.0
+    with pytest.raises(
+        ConfigurationError, match=r"channels = .*'lake'.* it must be some of inflow"
+    ):
+        recording.select(["lake"])
+
+
+def test_info_prints_the_card_and_draws_it(tmp_path: Path) -> None:
+    picture = tmp_path / "card.png"
+    printed = succeed("info", [str(LOGS / "tanks.csv"), "--picture", str(picture)]).out
+    assert "6,000 steps of 0 days 00:01:00" in printed
+    assert "middle [cm]" in printed
+    assert picture.stat().st_size > 10_000
+    error = refusal("info", ["LinearFusion", "--picture", str(picture)])
+    assert "it must be left out with a name that is no log" in error
+    assert "recording = " in refusal("info", [str(tmp_path / "absent.csv")])
