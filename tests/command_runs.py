@@ -108,6 +108,7 @@ SAID = {
     "model": {"the command line"},
     "papers": {"the command line", "paper"},
     "kinds": {"the command line", "kind"},
+    "log": {"the command line"},
     "name": {"the command line"},
 }
 

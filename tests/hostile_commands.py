@@ -46,6 +46,7 @@ BASES: dict[str, dict[str, list[str]]] = {
         "config": ["training.yaml"], "sweep": ["sweep.yaml"], "policy": ["always"],
         "output": ["made"], "episodes": ["2"],
     },
+    "fit": {"log": ["log.csv"], "output": ["made.yaml"], "channels": ["a"], "share": ["0.5"]},
     "list": {"kinds": ["rules"]},
     "info": {"name": ["whittle"]},
     "table": {"config": ["rows.yaml"], "episodes": ["2"]},
@@ -95,7 +96,8 @@ FILES = ["folder", "text/made.json", "locked/made.json", f"{LONG}.json", "loop",
 UNREADABLE = ["absent.yaml", "absent", "folder", "locked/file.yaml", "text/below.yaml", LONG,
               "loop.yaml"]  # fmt: skip
 # Words without a name before them.
-POSITIONAL = {("papers", "papers"), ("export", "model"), ("list", "kinds"), ("info", "name")}
+POSITIONAL = {("papers", "papers"), ("export", "model"), ("list", "kinds"), ("info", "name"),
+              ("fit", "log")}  # fmt: skip
 # Numbers among the hostile ones that an option may have after all.
 ALLOWED = {("seed", "0"), ("seeds", "0"), ("seed", "9" * 30)}
 

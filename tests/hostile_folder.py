@@ -59,6 +59,8 @@ def scratch(folder: Path) -> None:
     for name, raw in BROKEN.items():
         for suffix in ("", ".yaml", ".json"):
             (folder / f"{name}{suffix}").write_bytes(raw)
+    rows = (f"2026-01-01 {hour:02}:00,{hour}\n" for hour in range(24))
+    (folder / "log.csv").write_text("time,a\n" + "".join(rows))
     (folder / "folder").mkdir()
     (folder / "folder" / "file").write_text("kept")
     (folder / "locked").mkdir()

@@ -11,7 +11,9 @@ from fusion_gym.output.ending import report_errors
 from fusion_gym.validation import ConfigurationError, choice
 from fusion_gym.version import __version__
 
-COMMANDS = ("compare", "demo", "evaluate", "export", "info", "list", "search", "train", "watch")
+COMMANDS = (
+    "compare", "demo", "evaluate", "export", "fit", "info", "list", "search", "train", "watch",
+)  # fmt: skip
 
 
 def usage() -> str:

@@ -123,7 +123,7 @@ class Recording:
         Raises:
             ConfigurationError: the file cannot be read as a log.
         """
-        table, source = _table(Path(path)), f"recording = {os.fspath(path)!r}"
+        table, source = _table(Path(path)), f"log = {os.fspath(path)!r}"
         channels = [_channel(str(head), source) for head in table.columns[1:]]
         names = [channel.name for channel in channels]
         if len(set(names)) < len(names) or not names:
@@ -248,7 +248,7 @@ def _table(path: Path) -> pd.DataFrame:
         return pd.read_csv(path, sep=separator, skipinitialspace=True, encoding="utf-8-sig")
     except (OSError, ValueError, UnicodeError, EOFError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split()[:20])
-        raise refusal("recording", str(path), f"a CSV file ({reason})") from None
+        raise refusal("log", str(path), f"a CSV file ({reason})") from None
 
 
 def _channel(head: str, source: str) -> RecordedChannel:
@@ -312,7 +312,8 @@ def _on_even_times(
     off = int((np.abs(places - steps) > _OFF).sum())
     remarks += [f"{off} times between the even ones: rounded"] if off else []
     values = numbers.groupby(steps).first().reindex(np.arange(steps[-1] + 1))
-    return values.set_axis(numbers.index[0] + interval * values.index, axis=0)
+    first = numbers.index[0].tz_localize(None)
+    return values.set_axis(first + interval * values.index, axis=0)
 
 
 def _with_limits(

@@ -1,0 +1,78 @@
+r"""Fit a plant to a log of sensors, and write the option file that ``system=`` takes.
+
+    fusion-gym fit examples/recordings/mast.csv.xz --exact --output mast.yaml
+    fusion-gym evaluate --env fusion_gym/LinearFusion-v2 --set system=mast.yaml
+
+Level and daily cycle of every channel are removed. The plant is a vector autoregression of the
+rest, fitted to the first part. The table compares its errors with the real errors of the other
+part, under a periodic schedule at five rates; errors are relative to a channel's variance.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+import yaml
+
+from fusion_gym.commands.command_line import Command
+from fusion_gym.commands.options import Between, OutputFile
+from fusion_gym.output.files import write_text
+from fusion_gym.output.progress import remark, writing
+from fusion_gym.output.tables import console, table_tables
+from fusion_gym.recordings import Recording, fit
+from fusion_gym.recordings.fitting import (
+    criticise,
+    deviations,
+    noisy_channels,
+    residual_correlations,
+    warnings_of,
+)
+from fusion_gym.version import __version__
+
+
+@dataclass(frozen=True)
+class Fit(Command):
+    """Fit a plant to a log of sensors, and write the option file that system= takes."""
+
+    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
+    """The CSV file; fusion-gym info shows its data card."""
+    output: Annotated[Path, OutputFile(".yaml", ".yml")] = Path("plant.yaml")
+    """The option file."""
+    channels: tuple[str, ...] = ()
+    """Channels by name; by default all without a fault."""
+    share: Annotated[float, Between(0.0, 0.95)] = 0.5
+    """Share of the log, from its start, for the fit."""
+    exact: bool = False
+    """The readings are the truth: fit no measurement noise."""
+
+    def run(self) -> None:
+        """Fit, criticise and write."""
+        recording = Recording.read(self.log).select(self.channels)
+        plant = fit(recording, self.share, self.exact)
+        values, rows = deviations(recording, self.share)
+        criticism = criticise(plant, values[rows:])
+        title = f"{', '.join(plant.names)}: order {plant.order}, fitted to {rows:,} steps"
+        lines = [
+            (f"{row.rate:g}", f"{row.real:.4f}", f"{row.model:.4f}", f"{row.ratio:.2f}",
+             f"{row.nees:.2f}")
+            for row in criticism
+        ]  # fmt: skip
+        heads = "packets a sensor and step", "real error", "model's error", "ratio", "NEES"
+        console().print(table_tables(title, heads, lines))
+        white = residual_correlations(plant, values[rows:])
+        text = ", ".join(f"{name} {value:.2f} (lag {lag})" for name, lag, value in white)
+        print(f"largest correlations of residuals in ten lags: {text}")
+        for line in (
+            *recording.remarks,
+            *plant.remarks,
+            *warnings_of(plant, values[rows:], criticism),
+        ):
+            remark(f"warning: {line}")
+        if names := noisy_channels(plant):
+            remark(f"measurement noise of {', '.join(names)}: their readings are no truth")
+        writing(("option file", self.output))
+        source = f"# {Path(self.log).name}, the first {rows:,} steps of {recording.interval}"
+        units = "; ".join(f"{c.name} [{c.unit}]" for c in recording.channels)
+        text = yaml.safe_dump(plant.options, sort_keys=False, default_flow_style=None)
+        write_text(self.output, f"{source}\n# {units}\n# fusion-gym {__version__}\n{text}")

@@ -1,0 +1,368 @@
+"""A stable linear plant from the first part of a recording, and its criticism on the rest."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.linalg import solve_discrete_lyapunov
+from statsmodels.regression.linear_model import OLS
+from statsmodels.stats.diagnostic import acorr_ljungbox
+from statsmodels.tsa.deterministic import CalendarFourier, DeterministicProcess
+from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+
+from fusion_gym.arrays import Array
+from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.recordings.recording import Recording
+from fusion_gym.validation import number
+
+RATES = 0.3, 0.2, 0.1, 0.05, 0.02
+RATIOS = 0.8, 1.25  # real over model error without a warning
+NOISY = 0.25  # measurement variance over process variance of a channel whose truth is unknown
+_TARGET = 0.05  # rate at which the held-out error chooses the order
+_CLOSE = 1.02  # an order is good enough if its error is at most this times the least
+_ORDERS = 1, 2  # a lag adds a state for each channel
+_ITERATIONS = 200  # of expectation maximisation, at most
+_ROWS = 3000  # of a maximum-likelihood fit; least squares takes all
+_CYCLE = pd.Timedelta("7D"), pd.Timedelta("6h")  # least fitted time, longest interval
+_RADIUS = 0.9999  # largest spectral radius of a fitted plant
+_LEAST = 50  # complete steps of a fit, for each number in a row of the regression
+_CORRELATION = 0.25  # of residuals in the first ten lags: above it, a warning
+
+
+@dataclass(frozen=True)
+class FittedPlant:
+    """A vector autoregression of a recording's deviations, as a linear plant.
+
+    Args:
+        names: names of the channels as words.
+        transition: A (n, n) of the last ``order`` deviations of all channels, the newest first.
+        process_covariance: W (n, n).
+        measurement_variance: R (channels,).
+        order: number of lags.
+        remarks: remarks on the fit.
+
+    Example:
+        >>> from fusion_gym.recordings import Recording, fit
+        >>> plant = fit(Recording.read("examples/recordings/tanks.csv").select(), exact=True)
+        >>> plant.names, plant.order
+        (('inflow', 'middle', 'outflow'), 1)
+    """
+
+    names: tuple[str, ...]
+    transition: Array
+    process_covariance: Array
+    measurement_variance: Array
+    order: int
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def stationary_covariance(self) -> Array:
+        """Covariance (n, n) of the deviations without measurements."""
+        result = solve_discrete_lyapunov(self.transition, self.process_covariance)
+        return np.asarray(0.5 * (result + result.T), dtype=np.float64)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of LinearFusion; an error of a standard deviation costs 1 / channels."""
+        count, size = len(self.names), len(self.transition)
+        weights = np.zeros(size)
+        weights[:count] = 1.0 / np.diagonal(self.stationary_covariance)[:count] / count
+        lags = (f"_lag{lag}" if lag else "" for lag in range(self.order))
+        return {
+            "state_names": [f"{name}{lag}" for lag in lags for name in self.names],
+            "transition": self.transition.tolist(),
+            "process_covariance": self.process_covariance.tolist(),
+            "initial_covariance": self.stationary_covariance.tolist(),
+            "measurement_matrices": np.eye(count, size).tolist(),
+            "measurement_covariances": self.measurement_variance.tolist(),
+            "state_weights": weights.tolist(),
+        }
+
+    def filter(self, deviations: Array, smooth: bool = False) -> Any:
+        """Return statsmodels' results of deviations (T, channels), NaN where unknown.
+
+        Args:
+            deviations: deviations (T, channels).
+            smooth: whether to smooth after filtering.
+        """
+        count, size = len(self.names), len(self.transition)
+        model = KalmanSmoother(k_endog=count, k_states=size)
+        model.bind(np.asfortranarray(deviations.T))
+        model["design"] = np.eye(count, size)
+        model["obs_cov"] = np.diag(self.measurement_variance)
+        model["transition"] = self.transition
+        model["selection"] = np.eye(size)
+        model["state_cov"] = self.process_covariance
+        model.initialize_known(np.zeros(size), self.stationary_covariance)
+        return model.smooth() if smooth else model.filter()
+
+
+@dataclass(frozen=True)
+class Criticism:
+    """How well a plant predicts held-out deviations under a periodic schedule.
+
+    Args:
+        rate: packets a sensor and step.
+        real: mean squared error, each channel over its variance.
+        model: the error that the plant predicts.
+        nees: normalised squared error of the channels that do not send; 1 for an honest plant.
+
+    Example:
+        >>> from fusion_gym.recordings import Criticism
+        >>> Criticism(rate=0.05, real=0.2, model=0.25, nees=0.9).ratio
+        0.8
+    """
+
+    rate: float
+    real: float
+    model: float
+    nees: float
+
+    @property
+    def ratio(self) -> float:
+        """Real over model error."""
+        return self.real / self.model
+
+
+def words(recording: Recording) -> tuple[str, ...]:
+    """Return the channels' names as different words of letters, digits and '_'."""
+    result: list[str] = []
+    for channel in recording.channels:
+        word = re.sub(r"\W", "_", channel.name)
+        word = word if word.isidentifier() else f"_{word}"
+        result.append(word if word not in result else f"{word}_{len(result)}")
+    return tuple(result)
+
+
+def deviations(recording: Recording, share: float) -> tuple[Array, int]:
+    """Return the readings (T, channels) without level and daily cycle, and the fitted rows.
+
+    Least squares on the first ``share`` of the rows determines the level of each channel and, with
+    a week or more, two harmonics of a day.
+
+    Args:
+        recording: the recording.
+        share: share of the rows for the fit.
+    """
+    values, rows = recording.values, int(share * len(recording.values))
+    index = pd.DatetimeIndex(
+        values.index, freq=pd.tseries.frequencies.to_offset(recording.interval)
+    )
+    least, longest = _CYCLE
+    cycle = rows * recording.interval >= least and recording.interval <= longest
+    terms = [CalendarFourier("D", 2)] if cycle else []
+    known = DeterministicProcess(index, constant=True, additional_terms=terms).in_sample()
+    result = np.empty(values.shape)
+    for place, name in enumerate(values):
+        first = OLS(values[name].iloc[:rows], known.iloc[:rows], missing="drop").fit()
+        result[:, place] = values[name] - known @ first.params
+    return result, rows
+
+
+def fit(recording: Recording, share: float = 0.5, exact: bool = False) -> FittedPlant:
+    """Fit a plant to the first part of a recording.
+
+    The order, 1 or 2, is the smallest whose error at a rate of 0.05 is within 2 % of the least, on
+    the last third of this part. With measurement noise it is 1. The fit is least squares where
+    neighbouring steps have all readings. Otherwise, or without ``exact``, it is maximum likelihood
+    of a state space with missing values.
+
+    Args:
+        recording: the recording, with selected channels.
+        share: share of the rows for the fit, in (0, 0.95].
+        exact: whether the readings are the truth, without measurement noise.
+
+    Raises:
+        ConfigurationError: too few readings, or a value that is not allowed.
+
+    Example:
+        >>> from fusion_gym.recordings import Recording, fit
+        >>> fit(Recording.read("examples/recordings/tanks.csv").select(), exact=True).order
+        1
+    """
+    share = number("share", share, above=0.0, at_most=0.95)
+    values, rows = deviations(recording, share)
+    for place, channel in enumerate(recording.channels):
+        count = int(np.isfinite(values[:rows, place]).sum())
+        if count < _LEAST * (1 + len(recording.channels)):
+            raise refusal(
+                "recording", channel.name, f"a channel with at least "
+                f"{_LEAST * (1 + len(recording.channels))} readings in the fitted part, not {count}"
+            )  # fmt: skip
+    train, validation = values[: 2 * rows // 3], values[2 * rows // 3 : rows]
+    errors: dict[int, float] = {}
+    for order in _ORDERS if exact else (1,):  # readings hardly tell noise from a second lag
+        plant = _fit(recording, train, order, exact)
+        errors[order] = criticise(plant, validation, (_TARGET,))[0].real
+    good = _CLOSE * min(errors.values())
+    order = next(order for order, error in errors.items() if error <= good)
+    return _fit(recording, values[:rows], order, exact)
+
+
+def criticise(
+    plant: FittedPlant, values: Array, rates: Sequence[float] = RATES
+) -> tuple[Criticism, ...]:
+    """Compare real with predicted errors on deviations under periodic schedules.
+
+    Args:
+        plant: the plant.
+        values: deviations (T, channels), NaN where there is no reading.
+        rates: packets a sensor and step, in (0, 1].
+
+    Example:
+        >>> import numpy as np
+        >>> from fusion_gym.recordings import FittedPlant, criticise
+        >>> plant = FittedPlant(("x",), np.array([[0.5]]), np.eye(1), np.array([1e-6]), 1)
+        >>> values = np.random.default_rng(0).normal(size=(100, 1))
+        >>> [row.rate for row in criticise(plant, values, rates=(0.5, 0.1))]
+        [0.5, 0.1]
+    """
+    count, rows = values.shape[1], []
+    scale = np.diagonal(plant.stationary_covariance)[:count]
+    for rate in rates:
+        period = round(1.0 / rate)
+        turn = np.arange(len(values))[:, None] + (np.arange(count) * period) // count
+        sent = turn % period == 0
+        result = plant.filter(np.where(sent, values, np.nan))
+        error = values - result.filtered_state[:count].T
+        claimed = result.filtered_state_cov[:count, :count]
+        known = np.isfinite(values)
+        variance = np.diagonal(claimed).clip(0.0)
+        rows.append(
+            Criticism(
+                rate,
+                float((error**2 / scale)[known].mean()),
+                float((variance / scale)[known].mean()),
+                _nees(error, claimed, known & ~sent),
+            )
+        )
+    return tuple(rows)
+
+
+def warnings_of(plant: FittedPlant, values: Array, rows: Sequence[Criticism]) -> list[str]:
+    """Return the warnings of a criticism on deviations ``values`` (T, channels)."""
+    low, high = RATIOS
+    result = [
+        f"at rate {row.rate:g} the real error is {row.ratio:.2f} times the model's: the part that "
+        "was not fitted differs"
+        for row in rows
+        if not low <= row.ratio <= high
+    ]
+    for name, lag, value in residual_correlations(plant, values):
+        if abs(value) > _CORRELATION:
+            result.append(f"residuals of {name} are not white: correlation {value:.2f}, lag {lag}")
+    return result
+
+
+def noisy_channels(plant: FittedPlant) -> list[str]:
+    """Return the channels whose measurement noise is too large for readings as the truth."""
+    process = np.diagonal(plant.process_covariance)
+    pairs = zip(plant.names, plant.measurement_variance, process, strict=False)
+    return [name for name, noise, own in pairs if noise > NOISY * own]
+
+
+def residual_correlations(plant: FittedPlant, values: Array) -> Iterator[tuple[str, int, float]]:
+    """Yield the largest correlation of each channel's residuals in ten lags, with its lag."""
+    residuals = np.asarray(plant.filter(values).standardized_forecasts_error)
+    for name, residual in zip(plant.names, residuals, strict=True):
+        present = residual[np.isfinite(residual) & (residual != 0.0)]
+        table = acorr_ljungbox(present, lags=min(10, len(present) // 5), return_df=True)
+        steps = table["lb_stat"].diff().fillna(table["lb_stat"])  # each lag's n r² (n+2)/(n-k)
+        size = np.sqrt(steps * (len(present) - table.index) / (len(present) * (len(present) + 2)))
+        yield name, int(size.idxmax()), float(size.max())
+
+
+def _nees(error: Array, claimed: Array, marks: Any) -> float:
+    """Return the mean over steps of eᵀ P⁻¹ e / rank, of the marked channels."""
+    total = count = 0.0
+    patterns, places = np.unique(marks, axis=0, return_inverse=True)
+    for place, pattern in enumerate(patterns):
+        (chosen,) = np.nonzero(pattern)
+        steps = np.flatnonzero(places == place)
+        if len(chosen):
+            part = np.moveaxis(claimed[np.ix_(chosen, chosen, steps)], -1, 0)
+            own = error[np.ix_(steps, chosen)]
+            total += float((own * np.linalg.solve(part, own[..., None])[..., 0]).sum())
+            count += len(chosen) * len(steps)
+    return total / max(count, 1.0)
+
+
+def _is_complete(values: Array) -> bool:
+    """Return whether most steps and the steps before them have all readings."""
+    complete: Any = np.isfinite(values).all(axis=1)
+    return float((complete[1:] & complete[:-1]).mean()) > 0.5
+
+
+def _fit(recording: Recording, values: Array, order: int, exact: bool) -> FittedPlant:
+    count, remarks = values.shape[1], []
+    noise = np.array([max(row.resolution**2 / 12.0, 1e-12) for row in recording.card])
+    if exact and _is_complete(values):
+        lags = np.hstack([values[order - lag : len(values) - lag] for lag in range(1, order + 1)])
+        now = values[order:]
+        complete = np.isfinite(np.hstack([now, lags])).all(axis=1)
+        if complete.sum() < _LEAST * count * order:
+            raise ConfigurationError(
+                f"recording is not allowed with order {order}: {complete.sum()} steps have all "
+                f"readings with those before, and {_LEAST * count * order} must"
+            )
+        results = [OLS(column, lags[complete]).fit() for column in now[complete].T]
+        coefficients = np.array([result.params for result in results])
+        residuals = np.array([result.resid for result in results])
+        process = residuals @ residuals.T / results[0].df_resid
+    else:
+        coefficients, process, noise = _expectation_maximisation(values, order, noise, exact)
+    transition = np.eye(count * order, k=-count)
+    transition[:count] = coefficients
+    radius = float(np.abs(np.linalg.eigvals(transition)).max())
+    if radius > _RADIUS:
+        powers = np.repeat((_RADIUS / radius) ** np.arange(1, order + 1), count)
+        transition[:count] *= powers
+        remarks.append(f"spectral radius {radius:.5f} reduced to {_RADIUS}")
+    covariance = np.zeros((count * order, count * order))
+    covariance[:count, :count] = process
+    return FittedPlant(words(recording), transition, covariance, noise, order, tuple(remarks))
+
+
+def _expectation_maximisation(
+    values: Array, order: int, noise: Array, exact: bool
+) -> tuple[Array, Array, Array]:
+    """Return coefficients (channels, n), W and R (channels,) of the largest likelihood.
+
+    Source: R. H. Shumway and D. S. Stoffer, "An approach to time series smoothing and forecasting
+    using the EM algorithm", Journal of Time Series Analysis 3, 1982.
+    """
+    values = values[-_ROWS:]
+    count = values.shape[1]
+    size, variance, last = count * order, np.nanvar(values, axis=0), -np.inf
+    names = tuple(map(str, range(count)))
+    transition, process = np.eye(size, k=-count), np.zeros((size, size))
+    transition[:count, :count] = 0.9 * np.eye(count)
+    process[:count, :count] = np.diag(0.19 * variance)
+    noise = noise if exact else np.maximum(noise, 0.01 * variance)
+    for _ in range(_ITERATIONS):
+        plant = FittedPlant(names, transition, process, noise, order)
+        result = plant.filter(values, smooth=True)
+        mean, covariance = result.smoothed_state, result.smoothed_state_cov
+        moment = mean[:, :-1] @ mean[:, :-1].T + covariance[..., :-1].sum(-1)
+        # Statsmodels' autocovariance at t is that of the states at t + 1 and t.
+        both = mean[:count, 1:] @ mean[:, :-1].T
+        both += result.smoothed_state_autocov[:count, :, :-1].sum(-1)
+        now = mean[:count, 1:] @ mean[:count, 1:].T + covariance[:count, :count, 1:].sum(-1)
+        transition, process = transition.copy(), np.zeros((size, size))
+        transition[:count] = np.linalg.solve(moment, both.T).T
+        own = (now - transition[:count] @ both.T) / (len(values) - 1)
+        process[:count, :count] = 0.5 * (own + own.T)
+        radius = float(np.abs(np.linalg.eigvals(transition)).max())
+        transition[:count] *= min(1.0, _RADIUS / radius)
+        if not exact:
+            error = (values.T - mean[:count]) ** 2 + np.diagonal(covariance)[..., :count].T
+            noise = np.maximum(np.nanmean(error, axis=1), noise * 1e-3)
+        if abs(result.llf - last) < 1e-6 * abs(result.llf):
+            break
+        last = result.llf
+    return transition[:count], process[:count, :count], noise

@@ -1,0 +1,170 @@
+"""Plants fitted to logs of known plants, and their criticism."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.recordings import FittedPlant, RecordedChannel, Recording, criticise, fit
+from fusion_gym.recordings.fitting import (
+    RATES,
+    RATIOS,
+    deviations,
+    noisy_channels,
+    residual_correlations,
+    warnings_of,
+)
+from fusion_gym.validation import ConfigurationError
+from tests.command_runs import refusal, succeed
+
+LOGS = Path(__file__).parent.parent / "examples" / "recordings"
+A = np.array([[0.92, 0.05, 0.0], [0.04, 0.9, 0.05], [0.0, 0.06, 0.93]])
+W = np.array([[1.0, 0.2, 0.0], [0.2, 0.8, 0.1], [0.0, 0.1, 0.5]])
+
+
+def simulate(rows: int, seed: int = 0, second: NDArray[np.float64] | None = None) -> np.ndarray:
+    """A path of the tanks' plant; ``second`` is the coefficient of the second lag."""
+    noise = np.random.default_rng(seed).multivariate_normal(np.zeros(3), W, rows)
+    path = np.zeros((rows, 3))
+    for row in range(2, rows):
+        path[row] = A @ path[row - 1] + noise[row]
+        path[row] += 0.0 if second is None else second @ path[row - 2]
+    return path
+
+
+def recording(values: np.ndarray, every: str = "1min") -> Recording:
+    index = pd.date_range("2026-01-01", periods=len(values), freq=every)
+    names = [f"c{place}" for place in range(values.shape[1])]
+    return Recording(
+        pd.DataFrame(values, index=index, columns=names), tuple(map(RecordedChannel, names))
+    )
+
+
+def test_least_squares_finds_the_plant_within_its_intervals() -> None:
+    path = simulate(40_000)
+    plant = fit(recording(path), exact=True)
+    assert plant.order == 1
+    rows = 20_000
+    spread = np.linalg.inv(plant.stationary_covariance).diagonal()
+    error = np.sqrt(np.outer(W.diagonal(), spread) / rows)
+    assert np.all(np.abs(plant.transition - A) < 4.0 * error)
+    deviation = np.sqrt((np.outer(W.diagonal(), W.diagonal()) + W**2) / rows)
+    assert np.all(np.abs(plant.process_covariance - W) < 4.0 * deviation)
+
+
+def test_likelihood_finds_the_plant_despite_gaps_and_two_rates() -> None:
+    path = simulate(6000)
+    path[np.random.default_rng(1).random(path.shape) < 0.1] = np.nan
+    path[np.arange(6000) % 4 > 0, 2] = np.nan
+    plant = fit(recording(path), exact=True)
+    deviation = np.sqrt((np.outer(W.diagonal(), W.diagonal()) + W**2) / 3000)
+    deviation[2], deviation[:, 2] = 3.0 * deviation[2], 3.0 * deviation[:, 2]  # a quarter is seen
+    assert np.all(np.abs(plant.process_covariance - W) < 4.0 * deviation)
+    assert np.abs(plant.transition - A).max() < 0.06
+
+
+def test_likelihood_is_least_squares_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = recording(simulate(2000))
+    squares = fit(own, exact=True)
+    monkeypatch.setattr("fusion_gym.recordings.fitting._is_complete", lambda values: False)
+    likelihood = fit(own, exact=True)
+    assert likelihood.transition == pytest.approx(squares.transition, abs=0.002)
+    assert likelihood.process_covariance == pytest.approx(
+        squares.process_covariance, rel=0.01, abs=0.005
+    )
+
+
+def test_an_honest_plant_has_nees_of_one_and_no_warning() -> None:
+    values, rows = deviations(recording(simulate(120_000)), 0.5)
+    plant = fit(recording(simulate(120_000)), exact=True)
+    criticism = criticise(plant, values[rows:])
+    assert [row.rate for row in criticism] == list(RATES)
+    assert all(0.95 <= row.nees <= 1.05 for row in criticism), criticism
+    assert all(0.95 <= row.ratio <= 1.05 for row in criticism), criticism
+    assert not warnings_of(plant, values[rows:], criticism)
+
+
+def test_doubled_noise_in_the_second_half_gets_a_warning() -> None:
+    path = simulate(20_000)
+    path[10_000:] *= 2.0
+    own = recording(path)
+    plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
+    criticism = criticise(plant, values[rows:])
+    assert len(warnings_of(plant, values[rows:], criticism)) >= len(RATES)
+    assert all(3.5 < row.ratio < 4.5 for row in criticism)
+
+
+def test_a_second_lag_is_fitted_where_it_helps() -> None:
+    second = -0.5 * np.eye(3)
+    assert fit(recording(simulate(20_000, second=second)), exact=True).order == 2
+    plant = fit(recording(simulate(20_000, second=second)), exact=True)
+    assert plant.transition[:3, 3:] == pytest.approx(second, abs=0.05)
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", **plant.options)
+    assert task.system.state_names[3:] == ("c0_lag1", "c1_lag1", "c2_lag1")
+    assert not task.reward.state_weights[3:].any()
+
+
+def test_residuals_of_too_few_lags_are_not_white() -> None:
+    own = recording(simulate(20_000, second=-0.5 * np.eye(3)))
+    values, rows = deviations(own, 0.5)
+    plant = FittedPlant(("a", "b", "c"), A, W, np.full(3, 1e-6), 1)
+    assert max(value for _, _, value in residual_correlations(plant, values[rows:])) > 0.3
+    assert any("not white" in line for line in warnings_of(plant, values[rows:], []))
+    white = recording(simulate(20_000)).values.to_numpy()
+    assert max(value for _, _, value in residual_correlations(plant, white)) < 0.05
+
+
+def test_a_daily_cycle_is_removed() -> None:
+    path = simulate(6000)
+    cycle = np.cos(2.0 * np.pi * np.arange(6000) / 144)[:, None]
+    own = recording(path + 30.0 * cycle + 100.0, "10min")
+    values, _ = deviations(own, 0.5)
+    assert np.abs(cycle[:, 0] @ values / 3000).max() < 1.5  # of 30
+    short = recording(path[:600] + 30.0 * cycle[:600], "10min")
+    assert np.abs(cycle[:600, 0] @ deviations(short, 0.5)[0] / 300).min() > 20.0
+
+
+def test_a_channel_with_measurement_noise_is_named() -> None:
+    path = simulate(6000)
+    path[:, 1] += np.random.default_rng(2).normal(0.0, 1.5, 6000)
+    plant = fit(recording(path))
+    assert noisy_channels(plant) == ["c1"]
+    assert plant.measurement_variance[1] == pytest.approx(2.25, rel=0.2)
+
+
+def test_a_random_walk_becomes_a_stable_plant() -> None:
+    plant = fit(recording(np.random.default_rng(3).normal(size=(4000, 2)).cumsum(0)), exact=True)
+    assert np.abs(np.linalg.eigvals(plant.transition)).max() < 1.0
+
+
+@pytest.mark.parametrize(("rows", "share"), [(100, 0.5), (4000, 0.02)])
+def test_too_few_readings_are_refused(rows: int, share: float) -> None:
+    with pytest.raises(
+        ConfigurationError, match=r"recording = .c0. is not allowed: .* at least 200"
+    ):
+        fit(recording(simulate(rows)), share)
+
+
+def test_the_mast_has_errors_near_the_models() -> None:
+    own = Recording.read(LOGS / "mast.csv.xz").select()
+    plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
+    criticism = criticise(plant, values[rows:])
+    assert all(RATIOS[0] <= row.ratio <= RATIOS[1] for row in criticism), criticism
+    assert plant.order == 1
+
+
+def test_the_option_file_is_a_plant_of_the_environment(tmp_path: Path) -> None:
+    output = tmp_path / "tanks.yaml"
+    printed = succeed("fit", [str(LOGS / "tanks.csv"), "--exact", "--output", str(output)])
+    assert "inflow, middle, outflow: order 1, fitted to 3,000 steps" in printed.out
+    assert printed.err.count("warning") == 0, printed.err
+    content = yaml.safe_load(output.read_text())
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", system=str(output))
+    assert task.system.state_names == ("inflow", "middle", "outflow")
+    assert np.asarray(content["transition"]) == pytest.approx(A, abs=0.04)
+    error = refusal("fit", [str(LOGS / "tanks.csv"), "--channels", "lake"])
+    assert "channels = 'lake' is not allowed: it must be some of inflow, middle" in error
