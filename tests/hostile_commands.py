@@ -47,6 +47,7 @@ BASES: dict[str, dict[str, list[str]]] = {
         "output": ["made"], "episodes": ["2"],
     },
     "fit": {"log": ["log.csv"], "output": ["made.yaml"], "channels": ["a"], "share": ["0.5"]},
+    "field": {"log": ["log.csv"], "output": ["made"], "channels": ["a"], "share": ["0.5"]},
     "list": {"kinds": ["rules"]},
     "info": {"name": ["whittle"]},
     "table": {"config": ["rows.yaml"], "episodes": ["2"]},
@@ -97,7 +98,7 @@ UNREADABLE = ["absent.yaml", "absent", "folder", "locked/file.yaml", "text/below
               "loop.yaml"]  # fmt: skip
 # Words without a name before them.
 POSITIONAL = {("papers", "papers"), ("export", "model"), ("list", "kinds"), ("info", "name"),
-              ("fit", "log")}  # fmt: skip
+              ("fit", "log"), ("field", "log")}  # fmt: skip
 # Numbers among the hostile ones that an option may have after all.
 ALLOWED = {("seed", "0"), ("seeds", "0"), ("seed", "9" * 30)}
 

@@ -13,7 +13,8 @@ from fusion_gym.training.sweeps import Sweep
 
 
 def test_every_environment_is_there() -> None:
-    assert {setting.environment for setting in SETTINGS.values()} == set(ENVIRONMENTS)
+    others = {setting.environment for setting in SETTINGS.values()} ^ set(ENVIRONMENTS)
+    assert others == {"fusion_gym/RecordedFusion-v1"}  # agents learn on its fitted plant
 
 
 @pytest.mark.parametrize("setting", SETTINGS.values(), ids=SETTINGS)

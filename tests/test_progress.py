@@ -75,7 +75,7 @@ def test_where_nobody_watches_a_line_is_printed_now_and_then(
 
 
 def test_every_long_command_can_be_quiet() -> None:
-    assert set(EVERY) - set(LONG) <= {"export", "papers", "list", "info"}
+    assert set(EVERY) - set(LONG) <= {"export", "papers", "list", "info", "fit"}
 
 
 @pytest.mark.parametrize("name", LONG)

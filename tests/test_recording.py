@@ -11,7 +11,8 @@ from fusion_gym.recordings import ChannelCard, Recording
 from fusion_gym.validation import ConfigurationError
 from tests.command_runs import refusal, succeed
 
-LOGS = Path(__file__).parent.parent / "examples" / "recordings"
+ROOT = Path(__file__).parent.parent
+LOGS, TANKS = ROOT / "examples/recordings", ROOT / "fusion_gym/recordings/tanks.csv"
 
 
 def log(rows: int = 60, **columns: object) -> pd.DataFrame:
@@ -205,7 +206,7 @@ def test_the_mast_has_one_faulty_anemometer() -> None:
 
 
 def test_selected_channels_have_no_readings_at_their_limits() -> None:
-    recording = Recording.read(LOGS / "tanks.csv")
+    recording = Recording.read(TANKS)
     assert (recording.values["middle"] == 54.0).any()
     chosen = recording.select(["middle"])
     assert chosen.values["middle"].max() < 54.0
@@ -217,7 +218,7 @@ def test_selected_channels_have_no_readings_at_their_limits() -> None:
 
 def test_info_prints_the_card_and_draws_it(tmp_path: Path) -> None:
     picture = tmp_path / "card.png"
-    printed = succeed("info", [str(LOGS / "tanks.csv"), "--picture", str(picture)]).out
+    printed = succeed("info", [str(TANKS), "--picture", str(picture)]).out
     assert "6,000 steps of 0 days 00:01:00" in printed
     assert "middle [cm]" in printed
     assert picture.stat().st_size > 10_000

@@ -1,4 +1,4 @@
-"""Write tanks.csv: levels of three tanks from a known plant.
+"""Write fusion_gym/recordings/tanks.csv: levels of three tanks from a known plant.
 
     python examples/recordings/tanks.py
 
@@ -31,7 +31,7 @@ def main() -> None:
     heads = "inflow [cm]", "middle [cm] 0..54", "outflow [cm]"
     times = pd.date_range("2026-01-01", periods=ROWS, freq="min", name="time")
     table = pd.DataFrame(level.round(2), index=times, columns=heads)
-    table.to_csv(Path(__file__).with_name("tanks.csv"))
+    table.to_csv(Path("fusion_gym/recordings/tanks.csv"))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from fusion_gym.commands.options import Between, OutputFile
 from fusion_gym.output.files import write_text
 from fusion_gym.output.progress import remark, writing
 from fusion_gym.output.tables import console, table_tables
-from fusion_gym.recordings import Recording, fit
+from fusion_gym.recordings import FittedPlant, Recording, fit
 from fusion_gym.recordings.fitting import (
     criticise,
     deviations,
@@ -72,7 +72,12 @@ class Fit(Command):
         if names := noisy_channels(plant):
             remark(f"measurement noise of {', '.join(names)}: their readings are no truth")
         writing(("option file", self.output))
-        source = f"# {Path(self.log).name}, the first {rows:,} steps of {recording.interval}"
-        units = "; ".join(f"{c.name} [{c.unit}]" for c in recording.channels)
-        text = yaml.safe_dump(plant.options, sort_keys=False, default_flow_style=None)
-        write_text(self.output, f"{source}\n# {units}\n# fusion-gym {__version__}\n{text}")
+        write_text(self.output, plant_text(plant, recording, self.log, rows))
+
+
+def plant_text(plant: FittedPlant, recording: Recording, log: str, rows: int) -> str:
+    """Return the option file of a plant that was fitted to the first rows of a log."""
+    source = f"# {Path(log).name}, the first {rows:,} steps of {recording.interval}"
+    units = "; ".join(f"{c.name} [{c.unit}]" for c in recording.channels)
+    text = yaml.safe_dump(plant.options, sort_keys=False, default_flow_style=None)
+    return f"{source}\n# {units}\n# fusion-gym {__version__}\n{text}"

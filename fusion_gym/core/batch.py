@@ -43,7 +43,8 @@ class EpisodeBatch(Runs):
             ``None`` is the scheduler.
         reference: System on the same noise whose filter processes every measurement, for rewards in
             training. After each step ``reference_error`` (n, N) is the truth minus its estimate x*.
-        noise: Source of the noise, by default :class:`~fusion_gym.core.noise.PhiloxNoise`.
+        noise: Source of the noise, by default the task's, or else
+            :class:`~fusion_gym.core.noise.PhiloxNoise`.
     """
 
     reference_error: Array
@@ -59,7 +60,7 @@ class EpisodeBatch(Runs):
         memory = Memory(task, "scheduler" if memory_owner is None else memory_owner)
         super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
-        self.source: NoiseSource = PhiloxNoise() if noise is None else noise
+        self.source: NoiseSource = noise or task.noise or PhiloxNoise()
         self.seeds = np.random.SeedSequence().generate_state(num_envs, np.uint64).tolist()
         self.episodes = np.full(num_envs, -1)
         self.state = None

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import declaration
 from fusion_gym.arrays import Array
+from fusion_gym.core.noise import NoiseSource
 from fusion_gym.core.system import System
 from fusion_gym.errors import refusal
 from fusion_gym.fusion.table import Structure
@@ -188,6 +189,7 @@ class Scenario:
             ``memory_system`` is needed.
         no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
         required_policy: The policy whose silence the filter reads, or ``None``.
+        noise: Source of the noise; ``None`` draws standard normals.
     """
 
     options: CommonOptions
@@ -199,6 +201,7 @@ class Scenario:
     nodes_have_memory: bool = False
     no_estimates: str | None = None
     required_policy: str | None = None
+    noise: NoiseSource | None = None
 
 
 def plain_options(value: Any) -> Any:

@@ -115,6 +115,7 @@ class Runs:
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self.task, self.memory, self.layout = task, memory, layout
         self._silence = task.system.offers("with_possible")
+        self._gaps = task.system.offers("available")
         self._delivered: Any = None
 
     @property
@@ -146,6 +147,8 @@ class Runs:
         state = self.memory.deliver(self.state, system.deliver(state, granted), granted)
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
+        if self._gaps:
+            error = np.where(system.available(state)[1], error, 0.0)
         squared_error = error * error
         reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
         self._delivered, self.tokens, self.steps = state, tokens, self.steps + 1
@@ -169,10 +172,10 @@ class Runs:
     ) -> Grants:
         """Return the grants for requests (sensors, R) of the R ``runs``."""
         steps, queue = self.steps[runs], self.queue[:, runs]
+        if self._gaps or self.task.access in ("round_robin", "random"):
+            requests = requests & self.admitted()[:, runs]
         if self.task.access == "single":
             requests = first_request(requests, queue)
-        elif self.task.access in ("round_robin", "random"):
-            requests = requests & self.admitted()[:, runs]
         return self.task.bucket.grant(self.tokens[runs], requests, steps, queue)
 
     def sense(self, noise: Array) -> None:
@@ -232,8 +235,8 @@ class Runs:
         return self.memory.beliefs(self.state)
 
     def admitted(self) -> NDArray[np.bool_]:
-        """Return the sensors (sensors, N) that the access rule admits in the coming step."""
-        return access_mask(self.task.access, self.task.sensors, self.steps, self._lottery())
+        """Return the sensors (sensors, N) with a reading that the access rule now admits."""
+        return self._mask(self._lottery())
 
     def grantable(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) whose single request the network would grant now."""
@@ -272,6 +275,10 @@ class Runs:
         possible = self.admitted() & bucket.affordable(tokens)
         return possible & ~granted.any(0) if self.task.access == "single" else possible
 
+    def _mask(self, lottery: Array | None) -> NDArray[np.bool_]:
+        admitted = access_mask(self.task.access, self.task.sensors, self.steps, lottery)
+        return admitted & self.task.system.available(self.state)[0] if self._gaps else admitted
+
     def _lottery(self) -> Array | None:
         """Return the standard normals (N,) for random access, or ``None`` with another rule."""
         return None
@@ -306,9 +313,8 @@ class Branch(Runs):
     def sense(self, noise: Array) -> None:
         """Make the second half of a step with noise (channels, N)."""
         super().sense(noise)
-        lottery = noise[-1] if self.task.access == "random" else None
-        self._admitted = access_mask(self.task.access, self.task.sensors, self.steps, lottery)
+        self._admitted = self._mask(noise[-1] if self.task.access == "random" else None)
 
     def admitted(self) -> NDArray[np.bool_]:
-        """Return the sensors (sensors, N) that the access rule admits in the coming step."""
+        """Return the sensors (sensors, N) with a reading that the access rule now admits."""
         return self._admitted

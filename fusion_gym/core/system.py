@@ -321,7 +321,7 @@ class Signals(Mapping[str, SignalArray]):
 CAPABILITIES = (
     *("adopt", "arrival_probability", "arriving", "covariance_cycle", "error_covariance"),
     *("single_deliveries", "imagination_channels", "imagine", "with_actual_covariance"),
-    "with_possible",
+    *("available", "with_possible"),
 )
 
 
@@ -583,6 +583,17 @@ class System(ABC, Generic[StateT]):
         Systems whose covariances depend only on the deliveries offer it.
         """
         raise self._missing("covariance_cycle")
+
+    def available(self, state: StateT) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return the sensors (sensors, N) with a reading, and the states (n, N) of known truth.
+
+        A sensor without a reading cannot request, and errors of other states count as zero. Systems
+        that replay a recording with gaps offer it.
+
+        Args:
+            state: State after :meth:`sense`.
+        """
+        raise self._missing("available")
 
     def with_possible(self, state: StateT, possible: NDArray[np.bool_]) -> StateT:
         """Return the state for a delivery of which silence is information.

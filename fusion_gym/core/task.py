@@ -15,6 +15,7 @@ from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.admission import admit
 from fusion_gym.core.communication import communication
 from fusion_gym.core.nature import Nature
+from fusion_gym.core.noise import NoiseSource
 from fusion_gym.core.options import Action, Backend, CommonOptions, Scenario, plain_options
 from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.system import Knowledge, System, covers, least_covering
@@ -61,6 +62,7 @@ class Task:
         settings: The user's options, for reports.
         policy_defaults: The scenario's parameters of named policies.
         required_policy: The only policy that may run, or ``None``.
+        noise: Source of the noise, such as windows of a recording; ``None`` draws standard normals.
 
     Raises:
         ConfigurationError: A mode is unknown, the horizon is below 1, or the parts do not fit.
@@ -87,6 +89,7 @@ class Task:
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
     required_policy: str | None = None
+    noise: NoiseSource | None = None
 
     def __post_init__(self) -> None:
         validation.horizon(self.horizon)
@@ -172,6 +175,7 @@ class Task:
             settings=plain_options(asdict(options)),
             policy_defaults=scenario.policy_defaults,
             required_policy=scenario.required_policy,
+            noise=scenario.noise,
         )
 
     @property

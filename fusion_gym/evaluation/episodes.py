@@ -1,5 +1,6 @@
 """Run a policy over episodes whose noise is fixed by their seeds."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -97,6 +98,10 @@ def run_episodes(
     """
     validation.integer("episodes", episodes, at_least=1)
     validation.integer("seed", seed, at_least=0)
+    windows = getattr(task.noise, "count", episodes)
+    if episodes > windows:
+        text = f"episodes = {episodes}: the recording has {windows} windows, which repeat"
+        warnings.warn(text, stacklevel=2)
     parts = [
         _run_batch(task, policy, min(BATCH, episodes - first), seed + first, progress)
         for first in range(0, episodes, BATCH)
@@ -123,6 +128,15 @@ def _normalised_error(error: Array, covariance: Array) -> Array:
     return result
 
 
+def _counted(task: Task, state: Any, error: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return error and covariance whose normalised error has only the known truths."""
+    if not task.system.offers("available"):
+        return error, covariance
+    known = task.system.available(state)[1]
+    covariance = np.where(known[:, None] & known, covariance, np.eye(len(known))[..., None])
+    return error * np.sqrt(len(known) / np.maximum(known.sum(0), 1)), covariance
+
+
 def _run_batch(
     task: Task, policy: Policy, episodes: int, seed: int, progress: Callable[[int], Any] | None
 ) -> EpisodeResults:
@@ -137,12 +151,11 @@ def _run_batch(
     squared_error = np.empty((horizon, states))
     for step in range(horizon):
         outcome = batch.step(policy(batch.signals().limit(refused)))
-        mean, covariance = task.system.fused(batch.delivered)
-        error = task.system.truth(batch.delivered) - mean
+        covariance = task.system.fused(batch.delivered)[1]
         squared_error[step] = outcome.squared_error.mean(-1)
         mse += outcome.squared_error.sum(0)
         trace += linalg.trace(covariance)
-        nees += _normalised_error(error, covariance)
+        nees += _normalised_error(*_counted(task, batch.delivered, outcome.error, covariance))
         rate += outcome.granted
         requests += outcome.requested
         tokens += outcome.cost

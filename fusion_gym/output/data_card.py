@@ -11,7 +11,7 @@ from fusion_gym.output.palette import BLUE, VERMILLION
 from fusion_gym.output.tables import table_tables
 from fusion_gym.recordings import ChannelCard, Recording
 
-_COLUMNS = (
+COLUMNS = (
     "channel", "readings", "missing", "every", "mean", "deviation", "resolution", "saturated",
     "stuck", "spikes", "agreement", "fault",
 )  # fmt: skip
@@ -23,7 +23,7 @@ CAPTION = (
 
 def card_table(recording: Recording) -> Table:
     """Return the table of the channels."""
-    return table_tables("channels", _COLUMNS, map(_row, recording.card), CAPTION)
+    return table_tables("channels", COLUMNS, map(card_row, recording.card), CAPTION)
 
 
 def card_lines(recording: Recording) -> list[str]:
@@ -52,7 +52,8 @@ def draw_card(recording: Recording, path: Path) -> None:
     save_figure(figure, path)
 
 
-def _row(card: ChannelCard) -> tuple[str, ...]:
+def card_row(card: ChannelCard) -> tuple[str, ...]:
+    """Return the cells of a channel."""
     channel = card.channel
     limits = [f"{end:g}" for end in (channel.low, channel.high) if np.isfinite(end)]
     saturated = f"{card.saturated:.1%} at {' and '.join(limits)}" if limits else "–"

@@ -48,7 +48,7 @@ class FittedPlant:
 
     Example:
         >>> from fusion_gym.recordings import Recording, fit
-        >>> plant = fit(Recording.read("examples/recordings/tanks.csv").select(), exact=True)
+        >>> plant = fit(Recording.read("fusion_gym/recordings/tanks.csv").select(), exact=True)
         >>> plant.names, plant.order
         (('inflow', 'middle', 'outflow'), 1)
     """
@@ -65,6 +65,14 @@ class FittedPlant:
         """Covariance (n, n) of the deviations without measurements."""
         result = solve_discrete_lyapunov(self.transition, self.process_covariance)
         return np.asarray(0.5 * (result + result.T), dtype=np.float64)
+
+    @property
+    def typical_changes(self) -> tuple[float, ...]:
+        """Standard deviation of each channel's change in ten steps, in its unit."""
+        now = self.stationary_covariance
+        both = np.linalg.matrix_power(self.transition, 10) @ now
+        changes = np.sqrt(np.diagonal(2.0 * now - both - both.T))
+        return tuple(changes[: len(self.names)].tolist())
 
     @property
     def options(self) -> dict[str, Any]:
@@ -139,8 +147,8 @@ def words(recording: Recording) -> tuple[str, ...]:
     return tuple(result)
 
 
-def deviations(recording: Recording, share: float) -> tuple[Array, int]:
-    """Return the readings (T, channels) without level and daily cycle, and the fitted rows.
+def levels(recording: Recording, share: float) -> tuple[Array, int, Array]:
+    """Return deviations, fitted rows, and what was removed.
 
     Least squares on the first ``share`` of the rows determines the level of each channel and, with
     a week or more, two harmonics of a day.
@@ -148,41 +156,53 @@ def deviations(recording: Recording, share: float) -> tuple[Array, int]:
     Args:
         recording: the recording.
         share: share of the rows for the fit.
+
+    Returns:
+        Readings (T, channels) without level and cycle, the number of fitted rows, and the constant,
+        sine and cosine of one and of two periods a day (channels, 5).
     """
     values, rows = recording.values, int(share * len(recording.values))
-    index = pd.DatetimeIndex(
-        values.index, freq=pd.tseries.frequencies.to_offset(recording.interval)
-    )
+    interval = pd.tseries.frequencies.to_offset(recording.interval)
+    index = pd.DatetimeIndex(values.index, freq=interval)
     least, longest = _CYCLE
     cycle = rows * recording.interval >= least and recording.interval <= longest
     terms = [CalendarFourier("D", 2)] if cycle else []
     known = DeterministicProcess(index, constant=True, additional_terms=terms).in_sample()
-    result = np.empty(values.shape)
+    result, removed = np.empty(values.shape), np.zeros((values.shape[1], 5))
     for place, name in enumerate(values):
         first = OLS(values[name].iloc[:rows], known.iloc[:rows], missing="drop").fit()
         result[:, place] = values[name] - known @ first.params
-    return result, rows
+        removed[place, : len(first.params)] = first.params
+    return result, rows, removed
 
 
-def fit(recording: Recording, share: float = 0.5, exact: bool = False) -> FittedPlant:
+def deviations(recording: Recording, share: float) -> tuple[Array, int]:
+    """Return readings (T, channels) without level and daily cycle, and the fitted rows."""
+    return levels(recording, share)[:2]
+
+
+def fit(
+    recording: Recording, share: float = 0.5, exact: bool = False, order: int | None = None
+) -> FittedPlant:
     """Fit a plant to the first part of a recording.
 
-    The order, 1 or 2, is the smallest whose error at a rate of 0.05 is within 2 % of the least, on
-    the last third of this part. With measurement noise it is 1. The fit is least squares where
-    neighbouring steps have all readings. Otherwise, or without ``exact``, it is maximum likelihood
-    of a state space with missing values.
+    By default the order, 1 or 2, is the smallest whose error at a rate of 0.05 is within 2 % of the
+    least, on the last third of this part. With measurement noise it is 1. The fit is least squares
+    where neighbouring steps have all readings. Otherwise, or without ``exact``, it is maximum
+    likelihood of a state space with missing values.
 
     Args:
         recording: the recording, with selected channels.
         share: share of the rows for the fit, in (0, 0.95].
         exact: whether the readings are the truth, without measurement noise.
+        order: number of lags.
 
     Raises:
         ConfigurationError: too few readings, or a value that is not allowed.
 
     Example:
         >>> from fusion_gym.recordings import Recording, fit
-        >>> fit(Recording.read("examples/recordings/tanks.csv").select(), exact=True).order
+        >>> fit(Recording.read("fusion_gym/recordings/tanks.csv").select(), exact=True).order
         1
     """
     share = number("share", share, above=0.0, at_most=0.95)
@@ -196,11 +216,13 @@ def fit(recording: Recording, share: float = 0.5, exact: bool = False) -> Fitted
             )  # fmt: skip
     train, validation = values[: 2 * rows // 3], values[2 * rows // 3 : rows]
     errors: dict[int, float] = {}
-    for order in _ORDERS if exact else (1,):  # readings hardly tell noise from a second lag
-        plant = _fit(recording, train, order, exact)
-        errors[order] = criticise(plant, validation, (_TARGET,))[0].real
-    good = _CLOSE * min(errors.values())
-    order = next(order for order, error in errors.items() if error <= good)
+    if order is None and not exact:
+        order = 1  # readings hardly tell noise from a second lag
+    for lags in _ORDERS if order is None else ():
+        plant = _fit(recording, train, lags, exact)
+        errors[lags] = criticise(plant, validation, (_TARGET,))[0].real
+    good = _CLOSE * min(errors.values(), default=0.0)
+    order = order or next(lags for lags, error in errors.items() if error <= good)
     return _fit(recording, values[:rows], order, exact)
 
 

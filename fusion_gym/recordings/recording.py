@@ -70,7 +70,7 @@ class ChannelCard:
 
     Example:
         >>> from fusion_gym.recordings import Recording
-        >>> [card.fault for card in Recording.read("examples/recordings/tanks.csv").card]
+        >>> [card.fault for card in Recording.read("fusion_gym/recordings/tanks.csv").card]
         ['', '', '']
     """
 
@@ -99,7 +99,7 @@ class Recording:
 
     Example:
         >>> from fusion_gym.recordings import Recording
-        >>> recording = Recording.read("examples/recordings/tanks.csv")
+        >>> recording = Recording.read("fusion_gym/recordings/tanks.csv")
         >>> [channel.unit for channel in recording.channels]
         ['cm', 'cm', 'cm']
     """
@@ -123,6 +123,8 @@ class Recording:
         Raises:
             ConfigurationError: the file cannot be read as a log.
         """
+        if not isinstance(path, str | os.PathLike):
+            raise refusal("log", path, "the path of a CSV file")
         table, source = _table(Path(path)), f"log = {os.fspath(path)!r}"
         channels = [_channel(str(head), source) for head in table.columns[1:]]
         names = [channel.name for channel in channels]

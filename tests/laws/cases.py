@@ -93,6 +93,11 @@ VARIANTS: dict[str, list[Options]] = {
     "BiasedTracking": [
         {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"}
     ],
+    "RecordedFusion": [
+        {"filter": "hold"},
+        {"filter": "joint", "source": "normal"},
+        {"fit_share": 0.7, "memory": True},
+    ],
     "LinearFusion": [
         {"fusion": rule, "measurement_matrices": [[1, 0], [[0, 1], [1, 1]], [1, -1]]}
         for rule in ("ci", "sci")

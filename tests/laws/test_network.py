@@ -16,6 +16,7 @@ STEPS = 6
 THREE = {
     "LinearFusion": {"measurement_matrices": [[1, 0], [0, 1], [1, 1]]},
     "RemoteEstimation": {"sensors": 3},
+    "RecordedFusion": {"source": "normal"},
 }
 NOT_ADOPTING = ("MarkovJumpTracking", "UnknownInput", "RemoteEstimation", "RandomWalk")
 
@@ -58,18 +59,22 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
     batch, turns = EpisodeBatch.seeded(task, 40, 0), np.zeros(task.sensors)
     for step, target in enumerate(np.random.default_rng(0).random((STEPS, task.sensors, 40)) < 0.7):
         admitted = batch.signals()["admitted"]
+        sampled = read(batch).get("sampled", True) | ~task.system.offers("available")
         granted = batch.step(target).granted
         if access == "single":
-            np.testing.assert_array_equal(granted.sum(0), target.any(0))
+            np.testing.assert_array_equal(granted.sum(0), (target & sampled).any(0))
             assert not (granted & ~target).any()
             continue
         np.testing.assert_array_equal(granted, target & admitted)
         turns += admitted.sum(1)
+        if task.system.offers("available"):
+            assert not (admitted & ~sampled).any()
+            continue
         if access == "round_robin":
             assert (admitted == (np.arange(task.sensors) == step % task.sensors)[:, None]).all()
         else:
             assert (admitted.sum(0) == (task.sensors if access == "any" else 1)).all()
-    if access == "random":
+    if access == "random" and not task.system.offers("available"):
         mean = turns.sum() / task.sensors
         assert (np.abs(turns - mean) < 4.0 * np.sqrt(mean) * (task.sensors > 1) + 1e-9).all()
 
@@ -119,7 +124,10 @@ def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
     for request in requests(task, 3, STEPS):
         outcome = batch.step(request)
         mean, covariance = task.system.fused(batch.delivered)
-        np.testing.assert_allclose(outcome.error, task.system.truth(batch.delivered) - mean)
+        actual = task.system.truth(batch.delivered) - mean
+        if task.system.offers("available"):
+            actual *= task.system.available(batch.delivered)[1]
+        np.testing.assert_allclose(outcome.error, actual)
         size = outcome.error**2
         if selection["error"] == "trace":
             size = np.einsum("iir->ir", covariance)

@@ -1,0 +1,176 @@
+"""The report of a field study as Markdown and HTML, its picture, and the settings of devices."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import yaml
+from markdown_it import MarkdownIt
+
+from fusion_gym.docstrings import table
+from fusion_gym.evaluation.field_study import PRACTICE, FieldStudy, MethodPoint, MethodResult
+from fusion_gym.output.data_card import COLUMNS, card_lines, card_row
+from fusion_gym.output.figures import save_figure
+from fusion_gym.output.files import write_text
+from fusion_gym.output.palette import READABLE
+from fusion_gym.recordings import Criticism, Recording
+from fusion_gym.version import __version__
+
+RECOMMENDED = "silence used, one a sensor"
+MEANINGS = {
+    PRACTICE: "report on change, the centre holds the last reading; one scale of all thresholds",
+    "practice, one a sensor": "the same, one threshold for each sensor",
+    "silence ignored, one a sensor": "report on change, a Kalman filter",
+    "silence used": 'report on change, `filter="truncated"`; one scale of all thresholds',
+    RECOMMENDED: "the same, one threshold for each sensor",
+    "centralised": "value of information, a scheduler that sees all readings",
+    "agent": "counterfactual PPO, a scheduler that sees all readings",
+}
+_STYLE = "body{font-family:sans-serif;max-width:60em;margin:2em auto;padding:0 1em}td,th{\
+padding:.2em .7em;border-bottom:1px solid #ccc;text-align:left}img{max-width:100%}\
+pre{background:#f4f4f4;padding:1em;overflow:auto}table{border-collapse:collapse}"
+
+
+@dataclass(frozen=True)
+class FieldReport:
+    """What a report shows."""
+
+    name: str
+    whole: Recording
+    recording: Recording
+    study: FieldStudy
+    rows: int
+    criticism: Sequence[Criticism]
+    warnings: Sequence[str]
+    points: Mapping[str, Sequence[MethodPoint]]
+    results: Sequence[MethodResult]
+
+
+def write_report(report: FieldReport, folder: Path) -> str:
+    """Write report.md, report.html and devices.yaml, and return the results and settings."""
+    study, whole = report.study, report.whole
+    by_name = {result.name: result for result in report.results}
+    best, windows = by_name[RECOMMENDED], len(report.points[PRACTICE][0].errors)
+    seconds, settings = report.recording.interval.total_seconds(), _settings(report)
+    devices = yaml.safe_dump(settings, sort_keys=False)
+    summary = [
+        f"## At {study.rate:g} packets a sensor and step",
+        f"{windows} windows of {study.horizon} steps, which were not fitted. Errors are shares of "
+        "the channels' variance; the difference is to practice at equal packets, with a 95 % "
+        "block-bootstrap interval.",
+        results_table(report.results),
+        "## Recommendation",
+        f"Let every sensor report on change with its own threshold, and use silence at the centre. "
+        f"The error is {-best.relative.mean:.0%} lower than practice's at equal packets "
+        f"({-best.relative.high:.0%} to {-best.relative.low:.0%}). For practice's error it takes "
+        f"{best.packets:.0%} of the packets.",
+        device_table(report),
+        f"Intervals are in seconds; a step is {seconds:g} s. `devices.yaml`:",
+        f"```yaml\n{devices}```",
+        "The centre:",
+        f"```python\nimport fusion_gym\n\ntask = fusion_gym.make_task(\n"
+        f'    "fusion_gym/LinearFusion-v2", system="plant.yaml", filter="truncated", '
+        f'tokens="unlimited",\n    trigger="report_on_change", '
+        f"trigger_threshold={[row['reportable_change'] for row in settings.values()]},\n)\n```",
+    ]
+    ratios = [
+        (f"{r.rate:g}", f"{r.real:.4f}", f"{r.model:.4f}", f"{r.ratio:.2f}", f"{r.nees:.2f}")
+        for r in report.criticism
+    ]
+    text = [
+        f"# {report.name}",
+        f"By fusion-gym {__version__}.",
+        *summary,
+        "![Error over packets](curves.png)",
+        "## Methods",
+        table(("method", "meaning"), [(name, MEANINGS[name]) for name in report.points]),
+        "## The plant",
+        f"A vector autoregression of the first {report.rows:,} steps without level and daily "
+        "cycle, and its errors on the others under a periodic schedule.",
+        table(
+            ("packets a sensor and step", "real error", "plant's error", "ratio", "NEES"), ratios
+        ),
+        "\n".join(f"- Warning: {line}." for line in report.warnings) or "No warning.",
+        "## The log",
+        "\n".join(f"- {line}" for line in card_lines(whole)),
+        table(COLUMNS, [card_row(card) for card in whole.card]),
+        "![Readings of all channels](card.png)",
+    ]
+    markdown = "\n\n".join(text) + "\n"
+    page = MarkdownIt("commonmark").enable("table").render(markdown)
+    write_text(folder / "report.md", markdown)
+    head = f"<!doctype html><meta charset='utf-8'><title>{report.name}</title>"
+    write_text(folder / "report.html", f"{head}<style>{_STYLE}</style>\n{page}")
+    write_text(folder / "devices.yaml", devices)
+    return "\n\n".join(summary)
+
+
+def results_table(results: Sequence[MethodResult]) -> str:
+    """Return the table of the methods."""
+    heads = ("method", "error", "difference to practice", "packets at practice's error",
+             "real over simulated error")  # fmt: skip
+    rows = []
+    for result in results:
+        low, high = result.relative.low, result.relative.high
+        difference = f"{result.relative.mean:+.1%} [{low:+.1%}, {high:+.1%}]".replace("-", "−")
+        own = result.name != PRACTICE
+        rows.append((result.name, f"{result.error:.4f}", difference if own else "–",
+                     f"{result.packets:.0%}" if own else "–", f"{result.ratio:.2f}"))  # fmt: skip
+    return table(heads, rows)
+
+
+def device_table(report: FieldReport) -> str:
+    """Return the table of the recommended settings, beside practice's thresholds."""
+    point, practice = (_middle(report.points[name]) for name in (RECOMMENDED, PRACTICE))
+    day = 86_400.0 / report.recording.interval.total_seconds()
+    seconds = report.recording.interval.total_seconds()
+    rates = np.mean(point.rates, axis=0)
+    heads = ("sensor", "reportable_change", "min_interval", "max_interval", "packets a day",
+             "error (rms)", "practice's reportable_change")  # fmt: skip
+    rows = []
+    for place, channel in enumerate(report.recording.channels):
+        unit = f" {channel.unit}" if channel.unit else ""
+        rows.append((
+            channel.name, f"{point.thresholds[place]:.3g}{unit}", f"{seconds:g} s",
+            f"{report.study.max_interval * seconds:g} s", f"{rates[place] * day:.1f}",
+            f"{point.deviations[place]:.3g}{unit}", f"{practice.thresholds[place]:.3g}{unit}",
+        ))  # fmt: skip
+    return table(heads, rows)
+
+
+def draw_curves(study: FieldStudy, points: Mapping[str, Sequence[MethodPoint]], path: Path) -> None:
+    """Draw error over packets of every method on the held-out part."""
+    plt.rcParams.update(READABLE)
+    figure, panel = plt.subplots(figsize=(7.5, 4.8))
+    for name, own in points.items():
+        rates = [np.mean(point.rates) for point in own]
+        errors = [np.mean(point.errors) for point in own]
+        panel.loglog(rates, errors, "o-", ms=4, label=name)
+    panel.axvline(study.rate, color="grey", lw=1, ls=":")
+    panel.set(xlabel="packets a sensor and step", ylabel="error, as a share of the variance")
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
+    panel.legend(fontsize=8)
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def _settings(report: FieldReport) -> dict[str, dict[str, float]]:
+    """Return the settings of each sensor, in the unit of its readings and in seconds."""
+    point, seconds = _middle(report.points[RECOMMENDED]), report.recording.interval.total_seconds()
+    return {
+        channel.name: {
+            "reportable_change": float(f"{point.thresholds[place]:.4g}"),
+            "min_interval": seconds,
+            "max_interval": report.study.max_interval * seconds,
+        }
+        for place, channel in enumerate(report.recording.channels)
+    }
+
+
+def _middle(points: Sequence[MethodPoint]) -> MethodPoint:
+    """Return the point that was tuned for the target rate."""
+    return points[len(points) // 2]

@@ -1,0 +1,436 @@
+"""A linear plant whose episodes are windows of a recording: RecordedFusion-v1."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from fusion_gym.arrays import Array
+from fusion_gym.core.noise import PhiloxNoise
+from fusion_gym.core.options import Scenario
+from fusion_gym.core.system import Block, Signal, SignalArray
+from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.importing import require
+from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
+from fusion_gym.systems.tobit.system import SIGNALS, CensoredState, CensoredSystem
+from fusion_gym.validation import number, read_text
+
+_EXAMPLE = ("transition", "process_covariance", "initial_covariance", "measurement_matrices",
+            "measurement_covariances", "state_names", "joint_measurement_covariance")  # fmt: skip
+_PRIME = 7919  # windows between two episodes of a seed
+_LEAST = 100  # residuals to draw from
+_RESIDUAL = 1e-6  # of a deviation: changes that the process noise cannot make
+_READINGS = 0.5  # of the usual number in a window
+
+
+@dataclass(frozen=True)
+class RecordedFusionOptions(LinearFusionOptions):
+    """LinearFusion on the readings of a recording instead of simulated ones.
+
+    An episode is a window of the part of the log that was not fitted. Seed and episode determine
+    the window, and windows repeat beyond their number. The noise of the window leads the plant
+    through the recorded values, so every rule, agent and interface runs unchanged.
+
+    The states are the channels without level and daily cycle, and their lags. The signals
+    ``measurement``, ``held`` and ``expected_measurement`` are readings. A sensor without a reading
+    cannot request. Errors of states without a reading count as zero.
+
+    ``fusion-gym fit`` writes the plant for ``system``. Fit with ``--exact``: a channel with
+    measurement noise is refused, because its reading is no truth.
+
+    The default is a made-up log of three tanks.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/RecordedFusion-v1")
+        >>> task.noise.count, task.system.state_names
+        (29, ('inflow', 'middle', 'outflow'))
+    """
+
+    log: str | None = None
+    """Path of the log, a CSV file; the default is the made-up log."""
+    fit_share: float = 0.5
+    """Share of the log, from its start, that was fitted."""
+    source: Literal["recorded", "resampled", "normal"] = "recorded"
+    """Source of the process noise: ``"recorded"`` replays the windows. ``"resampled"`` draws from
+    the residuals of the fitted part, for training. ``"normal"`` draws from the plant's model."""
+
+    def nominal(self) -> RecordedFusionOptions:
+        """Return the options whose simulation scales the reward."""
+        own: Any = super().nominal()
+        result: RecordedFusionOptions = replace(own, source="normal")
+        return result
+
+
+@dataclass(slots=True)
+class RecordedState(CensoredState):
+    """The state of N runs: also the sensors (l, N) with a reading, and the time of day (N,)."""
+
+    available: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    day: Array = field(default_factory=lambda: np.empty(0))
+
+
+@dataclass(frozen=True)
+class RecordedSystem(CensoredSystem):
+    """A linear plant with gaps in its measurements, and readings with level and daily cycle.
+
+    ``level`` (l, 5) has the constant, sine and cosine of one and of two periods a day;
+    ``step`` is a step in days. A measurement's noise of NaN is a gap.
+    """
+
+    signals = (
+        *SIGNALS,
+        Signal("sampled", "own", "(sensors, N)", "whether the sensor has a reading"),
+    )
+    level: Array = field(default_factory=lambda: np.empty((0, 5)))
+    step: float = 0.0
+
+    def _level(self, state: RecordedState, time: Array) -> Array:
+        """Return what readings (l, 1, N) have beside deviations."""
+        turn = 2.0 * np.pi * (state.day + self.step * time)
+        waves = [np.ones_like(turn), np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
+        return (self.level @ np.array(waves))[:, None]
+
+    @property
+    def numpy_only(self) -> str | None:
+        """See :class:`System`."""
+        return "log"
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start, and the time of day."""
+        return super().start_channels + 1
+
+    @property
+    def observation(self) -> tuple[Block, ...]:
+        """See :class:`System`; exact sensors have no noise deviations to divide by."""
+        scale = self.scale[: self.sensor_count, None, None]
+        return tuple(
+            replace(
+                block,
+                value=lambda s: (s.measurement - s.held) / scale,
+                meaning="new minus last delivered reading, over the state's root mean square",
+                constants={"root mean square": scale[..., 0]},
+            )
+            if block.name == "held_difference"
+            else block
+            for block in super().observation
+        )
+
+    def offers(self, capability: str) -> bool:
+        """See :class:`System`; gaps make covariances unpredictable."""
+        return capability == "available" or (
+            capability != "covariance_cycle" and super().offers(capability)
+        )
+
+    def available(self, state: CensoredState) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """See :class:`System`; lagged states have no truth of their own."""
+        assert isinstance(state, RecordedState)
+        known = np.zeros((self.plant.size, state.truth.shape[-1]), dtype=np.bool_)
+        known[: self.sensor_count] = state.available
+        return state.available, known
+
+    def start(self, noise: Array) -> RecordedState:
+        """See :class:`System`; the last normal is the time of day."""
+        own = noise[2 * self.plant.size : -1]
+        plain = CensoredSystem.start(replace(self, known_start=False), np.nan_to_num(noise[:-1]))
+        values = {item.name: getattr(plain, item.name) for item in fields(plain)}
+        state = RecordedState(**values, available=np.isfinite(own), day=noise[-1])
+        prediction = self.centre.predict(
+            state.mean, state.covariance, state.measurement, state.time
+        )
+        state = self._without_gaps(replace(state, prediction=prediction))
+        everyone = np.ones((self.sensor_count, noise.shape[-1]), dtype=np.bool_)
+        delivered = self.deliver(replace(state, held=state.measurement), everyone)
+        return replace(delivered, prediction=None, age=np.zeros_like(delivered.age))
+
+    def sense(self, state: CensoredState, noise: Array) -> RecordedState:
+        """See :class:`System`; held readings stay while the level moves."""
+        assert isinstance(state, RecordedState)
+        moved = self._level(state, state.time + 1.0) - self._level(state, state.time)
+        own = noise[self.plant.noise_channels :]
+        result = super().sense(
+            replace(state, held=state.held - moved, available=np.isfinite(own)),
+            np.nan_to_num(noise),
+        )
+        assert isinstance(result, RecordedState)
+        return self._without_gaps(result)
+
+    def _without_gaps(self, state: RecordedState) -> RecordedState:
+        """Return the state with the expectation where a sensor has no reading."""
+        assert state.prediction is not None
+        expected = state.prediction.expectation.value
+        measurement = np.where(state.available[:, None], state.measurement, expected)
+        return replace(state, measurement=measurement)
+
+    def deliver(self, state: CensoredState, granted: NDArray[np.bool_]) -> RecordedState:
+        """See :class:`System`; a sensor without a reading delivers nothing."""
+        assert isinstance(state, RecordedState)
+        result = super().deliver(state, granted & state.available)
+        assert isinstance(result, RecordedState)
+        return result
+
+    def single_deliveries(self, state: CensoredState) -> tuple[Array, Array]:
+        """See :class:`System`."""
+        mean, covariance = super().single_deliveries(state)
+        available, _ = self.available(state)
+        silent = self.deliver(state, np.zeros_like(available))
+        return (
+            np.where(available[:, None], mean, silent.mean),
+            np.where(available[:, None, None], covariance, silent.covariance),
+        )
+
+    def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+        """Return the signals, measurements as readings."""
+        assert isinstance(state, RecordedState)
+        signals, level = dict(super().read(state)), self._level(state, state.time)
+        for name in ("measurement", "held", "expected_measurement"):
+            signals[name] = np.asarray(signals[name]) + level
+        reduction: Any = signals["variance_reduction"]
+        return signals | {
+            "sampled": state.available,
+            "variance_reduction": lambda: np.where(state.available, reduction(), 0.0),
+        }
+
+
+@dataclass(frozen=True)
+class WindowNoise:
+    """A :class:`~fusion_gym.core.noise.NoiseSource` that replays windows of a recording.
+
+    Args:
+        start_rows: start normals of each window (count, start_channels), with the time of day.
+        rows: normals of each step (T, noise_channels), NaN where a sensor has no reading.
+        first: row of each window's first step (count,).
+        processes: process noises r, the first normals of a step.
+    """
+
+    start_rows: Array
+    rows: Array
+    first: NDArray[np.int64]
+    processes: int
+
+    @property
+    def count(self) -> int:
+        """Number of windows."""
+        return len(self.first)
+
+    @property
+    def readings(self) -> Array:
+        """Share of the steps of each window at which each sensor has a reading (count, l)."""
+        length = int(np.diff(self.first).min()) if self.count > 1 else len(self.rows)
+        sensors = self.rows.shape[1] - self.processes
+        known = np.isfinite(self.rows[:, self.processes :])
+        result: Array = np.array(
+            [known[first : first + length].mean(0) for first in self.first]
+        ).reshape(-1, sensors)
+        return result
+
+    def window(self, seed: int, episode: int) -> int:
+        """Return the window of an episode."""
+        return (seed + _PRIME * episode) % self.count
+
+    def start(self, seed: int, episode: int, channels: int) -> Array:
+        """Return the normals (channels,) of the episode's start."""
+        return self.start_rows[self.window(seed, episode), :channels]
+
+    def steps(self, seed: int, episode: int, first: int, count: int, channels: int) -> Array:
+        """Return the normals (count, channels); a channel beyond the system's is drawn."""
+        begin = int(self.first[self.window(seed, episode)]) + first
+        rows = self.rows[begin : begin + count]
+        if channels == rows.shape[1]:
+            return rows
+        drawn = PhiloxNoise().steps(seed, episode, first, count, channels)
+        drawn[:, : rows.shape[1]] = rows
+        return drawn
+
+    def uniform(self, seed: int, episode: int) -> float:
+        """Return the number in [0, 1) that draws the episode's price."""
+        return PhiloxNoise().uniform(seed, episode)
+
+
+class ResampledNoise(PhiloxNoise):
+    """Normals whose process noise is drawn from residuals (K, r), with their own first normal."""
+
+    def __init__(self, residuals: Array) -> None:
+        super().__init__()
+        self.residuals = residuals
+
+    def steps(self, seed: int, episode: int, first: int, count: int, channels: int) -> Array:
+        """Return the noise (count, channels)."""
+        drawn = super().steps(seed, episode, first, count, channels)
+        chosen = (ndtr(drawn[:, 0]) * len(self.residuals)).astype(np.int64)
+        drawn[:, : self.residuals.shape[1]] = self.residuals[chosen]
+        return drawn
+
+
+class _Part(NamedTuple):
+    """The channels of a log: deviations (T, l), fitted rows, level (l, 5), and times in days."""
+
+    names: tuple[str, ...]
+    values: Array
+    rows: int
+    level: Array
+    day: Array
+    step: float
+
+
+@functools.lru_cache(maxsize=4)
+def _part(log: str, modified: float, names: tuple[str, ...] | None, share: float) -> _Part:
+    """Read the channels of a log, which was modified at a time."""
+    from fusion_gym.recordings import Recording
+    from fusion_gym.recordings.fitting import levels, words
+
+    whole = Recording.read(log)
+    known = dict(zip(words(whole), whole.channels, strict=True))
+    if names is None or not set(names) <= known.keys():
+        raise refusal("state_names", names, f"channels of {', '.join(known)}")
+    recording = whole.select([known[name].name for name in names])
+    values, rows, level = levels(recording, share)
+    index, day = recording.values.index, 86_400.0
+    times = np.asarray((index - index.normalize()).total_seconds()) / day
+    return _Part(names, values, rows, level, times, recording.interval.total_seconds() / day)
+
+
+def build_recorded(choice: RecordedFusionOptions) -> Scenario:
+    """Return the scenario of these options."""
+    require("a recording", "recordings", "pandas", "statsmodels")
+    from fusion_gym.recordings import FittedPlant
+    from fusion_gym.recordings.fitting import noisy_channels
+
+    if choice.log is None:
+        choice = _example(choice)
+    if not isinstance(choice.log, str | os.PathLike):
+        raise refusal("log", choice.log, "the path of a CSV file")
+    share = number("fit_share", choice.fit_share, above=0.0, at_most=0.95)
+    scenario = build_linear(choice)
+    system = scenario.system
+    assert isinstance(system, CensoredSystem)
+    if choice.source != "normal":
+        system.nature.refuse("with a recording", "the truth is the recording")
+    count, order = system.sensor_count, system.plant.size // system.sensor_count
+    names = None if choice.state_names is None else system.state_names[:count]
+    modified = os.path.getmtime(choice.log) if os.path.exists(choice.log) else 0.0
+    part = _part(choice.log, modified, names, share)
+    matrix = system.centre.sensors.measurement_matrix[:, 0, :, 0]
+    if not np.array_equal(matrix, np.eye(count, count * order)):
+        raise refusal("measurement_matrices", matrix, "rows of the identity, one for each channel")
+    plant, variance = system.plant, system.centre.sensors.variance[:, 0, 0]
+    fitted = FittedPlant(
+        part.names, plant.transition[..., 0], plant.process_covariance[..., 0], variance, order
+    )
+    if noisy := noisy_channels(fitted):
+        raise refusal(
+            "measurement_covariances", variance, f"those of exact readings: the noise of "
+            f"{', '.join(noisy)} makes a reading no truth; fit with --exact if it is one"
+        )  # fmt: skip
+    noise = {
+        "normal": lambda: None,
+        "resampled": lambda: ResampledNoise(_residuals(plant, part)),
+        "recorded": lambda: _windows(plant, part, choice.horizon),
+    }[choice.source]()
+    memory = scenario.memory_system
+
+    def recorded(own: CensoredSystem) -> RecordedSystem:
+        parts = {item.name: getattr(own, item.name) for item in fields(own)}
+        return RecordedSystem(**parts, level=part.level, step=part.step)
+
+    return replace(
+        scenario,
+        system=recorded(system),
+        memory_system=recorded(memory) if isinstance(memory, CensoredSystem) else memory,
+        noise=noise,
+    )
+
+
+def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:
+    """Return the options with the made-up log and its plant."""
+    from fusion_gym.yaml_text import parsed
+
+    folder = Path(str(files("fusion_gym.recordings")))
+    for name in _EXAMPLE:
+        if getattr(choice, name) is not getattr(LinearFusionOptions, name):
+            raise refusal(name, getattr(choice, name), "left out without a log")
+    path = folder / "tanks.yaml"
+    options = parsed(read_text("system", path), str(path))
+    if choice.state_weights is not None:
+        options["state_weights"] = choice.state_weights
+    return replace(choice, log=str(folder / "tanks.csv"), **options)
+
+
+def _filled(values: Array) -> Array:
+    """Return deviations (T, l) with straight lines in gaps, which no policy sees."""
+    result, places = values.copy(), np.arange(len(values))
+    for column in result.T:
+        known = np.isfinite(column)
+        column[~known] = np.interp(places[~known], places[known], column[known])
+    return result
+
+
+def _noises(plant: LinearPlant, path: Array, count: int) -> Array:
+    """Return the process noise (T - 1, r) that leads along the states of a path (T, n)."""
+    factor, transition = plant.process_factor[..., 0], plant.transition[..., 0]
+    changes = path[1:] - path[:-1] @ transition.T
+    result: Array = changes @ np.linalg.pinv(factor).T
+    scale = np.sqrt(np.diagonal(factor @ factor.T))[:count].min()
+    if not np.abs(result @ factor.T - changes).max() <= _RESIDUAL * max(scale, _RESIDUAL):
+        raise ConfigurationError(
+            "process_covariance is not allowed with this recording: its noise cannot lead through "
+            "all readings; each channel needs process noise of its own"
+        )
+    return result
+
+
+def _states(values: Array, order: int) -> Array:
+    """Return states (T, n) of deviations (T, l): the newest first, then its lags."""
+    path = _filled(values)
+    lags = [np.vstack([path[:1]] * lag + [path[: len(path) - lag]]) for lag in range(order)]
+    return np.hstack(lags)
+
+
+def _residuals(plant: LinearPlant, part: _Part) -> Array:
+    """Return the process noises (K, r) between complete steps of the fitted part."""
+    values, count = part.values[: part.rows], len(part.names)
+    order = plant.size // count
+    noise = _noises(plant, _states(values, order), count)
+    known: Any = np.isfinite(values).all(axis=1)
+    complete: Any = np.all(
+        [known[order - lag : len(known) - lag] for lag in range(order + 1)], axis=0
+    )
+    noise = noise[order - 1 :][complete]
+    if len(noise) < _LEAST:
+        raise refusal(
+            "source", "resampled", f"'normal' with this recording: {len(noise)} neighbouring steps "
+            f"have all readings, and {_LEAST} must"
+        )  # fmt: skip
+    return noise
+
+
+def _windows(plant: LinearPlant, part: _Part, horizon: int) -> WindowNoise:
+    """Return the windows of the part that was not fitted."""
+    values, rows, count = part.values, part.rows, len(part.names)
+    order = plant.size // count
+    path, known = _states(values, order)[rows:], np.isfinite(values[rows:])
+    gaps = np.where(known, 0.0, np.nan)
+    steps = np.hstack([_noises(plant, path, count), gaps[1:]])
+    starts = np.arange(order - 1, len(path) - horizon - 1, horizon + 1)
+    present = np.array([known[first : first + horizon + 1].mean() for first in starts])
+    starts = starts[present >= _READINGS * known.mean()]
+    if not len(starts):
+        raise refusal(
+            "horizon", horizon, f"shorter: {len(path):,} steps of the log were not fitted"
+        )
+    root = plant.initial_factor[..., 0]
+    moved = (path[starts] - plant.initial_mean[:, 0]) @ np.linalg.pinv(root).T
+    still, day = np.zeros_like(moved), part.day[rows:][starts, None]
+    start = np.hstack([still, moved, gaps[starts], day])
+    return WindowNoise(start, steps, starts, plant.noise_channels)

@@ -1,0 +1,99 @@
+"""fusion-gym field: from a log to the settings of devices."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from fusion_gym.commands.field import AGENT, Field
+from fusion_gym.evaluation import field_study
+from fusion_gym.evaluation.field_study import (
+    METHODS,
+    PRACTICE,
+    FieldStudy,
+    MethodPoint,
+    compare_with_practice,
+)
+from tests.command_runs import refusal, succeed
+
+TANKS = str(Path(__file__).parent.parent / "fusion_gym/recordings/tanks.csv")
+STUDY = FieldStudy({}, rate=0.05, shape=(1.0, 1.0), horizon=50, source="normal")
+
+
+def point(factor: float, error: float, spread: float = 0.0, windows: int = 40) -> MethodPoint:
+    """A point at a multiple of the target rate, with errors that vary between windows."""
+    draw = np.random.default_rng(0).normal(size=windows)
+    draw = spread * (draw - draw.mean())
+    rates = [[0.05 * factor] * 2] * windows
+    return MethodPoint(
+        [1.0], error, 0.05 * factor, (error * (1.0 + draw)).tolist(), rates, [1.0, 1.0]
+    )
+
+
+def test_methods_are_compared_at_equal_packets_and_at_equal_error() -> None:
+    """Errors that are powers of the rate: closed forms."""
+    factors = (0.5, 0.7, 1.0, 1.4, 2.0)
+    points = {
+        PRACTICE: [point(f, 0.4 / f) for f in factors],
+        "silence used": [point(1.3 * f, 0.1 / (1.3 * f)) for f in factors],
+        "centralised": [point(f, 0.3 / f, 0.2) for f in factors],
+    }
+    results = {result.name: result for result in compare_with_practice(STUDY, points)}
+    assert results["silence used"].relative.mean == pytest.approx(-0.75, abs=1e-9)
+    assert results["silence used"].relative.high == pytest.approx(-0.75, abs=1e-9)
+    assert results["silence used"].packets == pytest.approx(0.25, abs=1e-6)
+    assert results["centralised"].relative.low < -0.25 < results["centralised"].relative.high
+    assert results[PRACTICE].packets == pytest.approx(1.0)
+    assert results[PRACTICE].ratio == pytest.approx(1.0)
+
+
+def test_a_study_ends_in_the_settings_of_devices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field_study, "_TRIALS", 4)
+    monkeypatch.setattr(field_study, "_EPISODES", 8)
+    folder = tmp_path / "field"
+    words = [TANKS, "--exact", "--output", str(folder), "--timesteps", "4000", "--workers", "1"]
+    printed = succeed("field", words).out
+    settings = yaml.safe_load((folder / "devices.yaml").read_text())
+    assert list(settings) == ["inflow", "middle", "outflow"]
+    assert all(row["min_interval"] == 60.0 for row in settings.values())
+    assert all(row["max_interval"] == 12_000.0 for row in settings.values())
+    assert all(0.1 < row["reportable_change"] < 30.0 for row in settings.values())
+    report = (folder / "report.md").read_text()
+    for text in (*METHODS, AGENT, "packets a day", "`devices.yaml`", "![Error over packets]"):
+        assert text in report
+    assert printed.strip() in report
+    assert "<table>" in (folder / "report.html").read_text()
+    assert {path.name for path in folder.glob("*.png")} == {"card.png", "curves.png"}
+    code = report.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(folder)
+    exec(code, {})
+    assert "already holds a study" in refusal("field", words)
+    assert "target_rate = 0.1 differs" in refusal("field", [*words, "--target-rate=.1", "--resume"])
+    (folder / "silence_used.json").unlink()
+    before = json.loads((folder / "practice.json").read_text())
+    again = succeed("field", [*words, "--resume"]).out
+    assert again == printed
+    assert json.loads((folder / "practice.json").read_text()) == before
+
+
+def test_a_channel_with_noise_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    draw = np.random.default_rng(0)
+    lines = ["time,a"]
+    level = 0.0
+    for step in range(3000):
+        level = 0.95 * level + draw.normal()
+        lines.append(f"{60 * step + 1_700_000_000},{level + 2.0 * draw.normal():.3f}")
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    output = tmp_path / "field"
+    error = refusal("field", [str(tmp_path / "log.csv"), "--output", str(output)])
+    assert "give --exact if they are" in error
+    assert not output.exists()
+
+
+def test_an_interrupt_says_how_to_continue() -> None:
+    command = Field("log.csv")
+    assert command.again().endswith("--resume")

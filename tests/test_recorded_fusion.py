@@ -1,0 +1,252 @@
+"""RecordedFusion: episodes are windows of a log."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.recordings import Recording, fit
+from fusion_gym.recordings.fitting import deviations
+from fusion_gym.systems.tobit.recorded import WindowNoise
+from fusion_gym.validation import ConfigurationError
+
+ENV = "fusion_gym/RecordedFusion-v1"
+ROWS, HORIZON = 3000, 40
+
+
+def write(folder: Path, change: Callable[[np.ndarray], Any] = lambda path: None) -> str:
+    """Write a log of two channels with a daily cycle; ``change`` edits the readings (rows, 2)."""
+    draw = np.random.default_rng(0).normal(size=(ROWS, 2))
+    path = np.zeros((ROWS, 2))
+    for row in range(1, ROWS):
+        path[row] = [[0.9, 0.05], [0.0, 0.8]] @ path[row - 1] + draw[row]
+    path += 50.0 + 10.0 * np.sin(2.0 * np.pi * np.arange(ROWS) / 96)[:, None]
+    change(path)
+    index = pd.date_range("2026-01-01 05:00", periods=ROWS, freq="15min", name="time")
+    pd.DataFrame(path, index=index, columns=["a [K]", "b [K]"]).to_csv(folder / "log.csv")
+    return str(folder / "log.csv")
+
+
+def make(log: str, **options: Any) -> Task:
+    plant = fit(Recording.read(log).select(), exact=True, order=1).options
+    free = {"tokens": "unlimited", "horizon": HORIZON} | plant | options
+    return fusion_gym.make_task(ENV, log=log, **free)
+
+
+def scatter(path: np.ndarray) -> None:
+    path[np.random.default_rng(1).random(path.shape) < 0.1] = np.nan
+
+
+def rows_of(task: Task, runs: int) -> list[slice]:
+    assert isinstance(task.noise, WindowNoise)
+    first = [ROWS // 2 + int(task.noise.first[run % task.noise.count]) for run in range(runs)]
+    return [slice(row + 1, row + HORIZON + 1) for row in first]
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_truth_is_the_recording(order: int, tmp_path: Path) -> None:
+    """Also with the singular process noise of two lags."""
+    log = write(tmp_path)
+    recording = Recording.read(log).select()
+    values, rows = deviations(recording, 0.5)
+    plant = fit(recording, exact=True, order=1)
+    options: dict[str, Any] = {}
+    if order == 2:
+        transition, process = np.eye(4, k=-2), np.zeros((4, 4))
+        transition[:2] = np.hstack([plant.transition, -0.1 * np.eye(2)])
+        process[:2, :2] = plant.process_covariance
+        start = np.kron(np.eye(2), plant.stationary_covariance)
+        two = replace(plant, transition=transition, process_covariance=process, order=2)
+        options = two.options | {"initial_covariance": start.tolist()}
+    task = make(log, **options)
+    assert rows == ROWS // 2
+    batch = EpisodeBatch.seeded(task, 20, 0)
+    for step in range(HORIZON):
+        for run, row in enumerate(rows_of(task, 20)):
+            truth = task.system.truth(batch.state)[:2, run]
+            assert truth == pytest.approx(values[row.start + step], abs=1e-11)
+        batch.step(np.zeros((2, 20), dtype=np.bool_))
+
+
+def test_held_readings_are_those_of_the_log(tmp_path: Path) -> None:
+    """Report on change with hold: an independent loop over the readings, cycle included."""
+    log = write(tmp_path)
+    task = make(log, filter="hold")
+    results = run_episodes(
+        task, fusion_gym.make_policy("report_on_change:reportable_change=3", task), 20, 0
+    )
+    readings = Recording.read(log).values.to_numpy()
+    for run, row in enumerate(rows_of(task, 20)):
+        held, error, sent = readings[row.start - 1].copy(), 0.0, 0
+        for reading in readings[row]:
+            report = np.abs(reading - held) >= 3.0
+            held, sent = np.where(report, reading, held), sent + report.sum()
+            error += ((reading - held) ** 2).sum()
+        assert results.rate[run].sum() * HORIZON == pytest.approx(sent)
+        assert results.mse[run] * HORIZON == pytest.approx(error, rel=1e-3, abs=1e-3)
+
+
+def test_signals_are_readings(tmp_path: Path) -> None:
+    log = write(tmp_path)
+    task, readings = make(log), Recording.read(log).values.to_numpy()
+    batch = EpisodeBatch.seeded(task, 5, 0)
+    for step in range(10):
+        signals = batch.signals()
+        measured = np.array([readings[row.start + step] for row in rows_of(task, 5)])
+        assert pytest.approx(measured, abs=1e-9) == signals["measurement"][:, 0].T
+        innovation = signals["measurement"] - signals["expected_measurement"]
+        assert np.allclose(innovation, signals["innovation"], atol=1e-9)
+        batch.step(np.zeros((2, 5), dtype=np.bool_))
+
+
+def test_a_percentage_is_of_the_reading(tmp_path: Path) -> None:
+    task = make(write(tmp_path), filter="hold")
+    few, many = (
+        run_episodes(task, fusion_gym.make_policy(rule, task), 20, 0).rate.mean()
+        for rule in (
+            "report_on_change:reportable_change=6,percent=true",
+            "report_on_change:reportable_change=3",
+        )
+    )
+    assert few == pytest.approx(many, rel=0.15)  # 6 % of 50
+
+
+def test_a_sensor_without_a_reading_does_nothing(tmp_path: Path) -> None:
+    log = write(tmp_path, scatter)
+    task, readings = make(log, memory=True), Recording.read(log).values.to_numpy()
+    batch, before, seen = EpisodeBatch.seeded(task, 30, 0), None, 0
+    for step in range(HORIZON):
+        present = np.isfinite([readings[row.start + step] for row in rows_of(task, 30)]).T
+        assert (batch.signals()["sampled"] == present).all()
+        assert (batch.grantable() == present).all()
+        value = batch.beliefs().value()
+        assert np.abs(value[~present]).max(initial=0.0) < 1e-9
+        outcome = batch.step(np.ones((2, 30), dtype=np.bool_))
+        assert (outcome.granted == present).all()
+        assert np.array_equal(outcome.cost, 3.0 * present.sum(0))
+        assert not outcome.error[~present].any()
+        assert np.isfinite(batch.observe()).all()
+        seen += int((~present).sum())
+        before = outcome
+    assert seen > 100
+    assert before is not None
+
+
+@pytest.mark.parametrize("options", [{}, {"memory": True}, {"filter": "hold"}])
+def test_nothing_shows_the_future(options: dict[str, Any], tmp_path: Path) -> None:
+    """Another future, gaps included, changes no observation and no signal before it."""
+    log, change = write(tmp_path, scatter), ROWS // 2 + 30
+    task = make(log, **options)
+
+    def other(path: np.ndarray) -> None:
+        scatter(path)
+        path[change:] = np.roll(path[change:], 7, axis=0) + 1.0
+
+    plant = fit(Recording.read(log).select(), exact=True, order=1).options
+    free = {"tokens": "unlimited", "horizon": HORIZON}
+    changed = fusion_gym.make_task(ENV, log=write(tmp_path, other), **free | plant | options)
+    assert isinstance(task.noise, WindowNoise)
+    assert task.noise.first[0] == 0
+    batches = [EpisodeBatch.seeded(item, 1, 0) for item in (task, changed)]
+    requests = np.random.default_rng(0).random((HORIZON, 2, 1)) < 0.3
+    for step in range(28):
+        first, second = (batch.observe() for batch in batches)
+        assert np.allclose(first, second, atol=1e-6), step
+        for batch in batches:
+            batch.step(requests[step])
+    for step in range(28, 34):
+        for batch in batches:
+            batch.step(requests[step])
+    assert not np.allclose(batches[0].observe(), batches[1].observe(), atol=1e-3)
+
+
+def test_seed_and_episode_determine_the_window(tmp_path: Path) -> None:
+    task = make(write(tmp_path))
+    noise = task.noise
+    assert isinstance(noise, WindowNoise)
+    assert len({noise.window(seed, 0) for seed in range(noise.count)}) == noise.count > 30
+    assert len({noise.window(0, episode) for episode in range(noise.count)}) == noise.count
+    policy = fusion_gym.make_policy("periodic:period=5", task)
+    with pytest.warns(UserWarning, match=f"recording has {noise.count} windows, which repeat"):
+        results = run_episodes(task, policy, 2 * noise.count, 0)
+    assert results.mse[: noise.count] == pytest.approx(results.mse[noise.count :])
+    with pytest.warns(UserWarning, match="repeat"):
+        run_episodes(task, policy, 100, 7)
+
+
+def test_every_interface_replays_the_window(tmp_path: Path) -> None:
+    log = write(tmp_path)
+    options = fit(Recording.read(log).select(), exact=True).options
+    whole: dict[str, Any] = {"log": log, "tokens": "unlimited", "horizon": HORIZON} | options
+    single = fusion_gym.FusionEnv(fusion_gym.make_task(ENV, **whole))
+    observation, _ = single.reset(seed=3)
+    batch = EpisodeBatch.seeded(fusion_gym.make_task(ENV, **whole), 5, 0)
+    assert np.array_equal(observation, batch.observe()[3])
+    envs = fusion_gym.make_sb3_vec_env(ENV, 5, seed=0, **whole)
+    assert np.array_equal(envs.reset()[3], observation)
+
+
+def test_resampled_noise_has_the_residuals_of_the_fitted_part(tmp_path: Path) -> None:
+    """A channel whose noise is 0 or 5 keeps such steps, which normal noise does not make."""
+
+    def jump(path: np.ndarray) -> None:
+        path[:, 1] = 50.0 + 5.0 * (np.random.default_rng(2).random(ROWS) < 0.1).cumsum() % 40.0
+
+    log = write(tmp_path, jump)
+    errors = {}
+    for source in ("resampled", "normal"):
+        batch = EpisodeBatch.seeded(make(log, source=source), 200, 0)
+        before = batch.task.system.truth(batch.state)
+        batch.step(np.zeros((2, 200), dtype=np.bool_))
+        moved = batch.task.system.truth(batch.state)[1] - before[1]
+        errors[source] = float((np.abs(moved) > 4.0).mean())
+        assert batch.task.noise is None or batch.task.system.offers("available")
+    assert errors["resampled"] == pytest.approx(0.1, abs=0.06)
+    assert abs(errors["normal"] - 0.1) > abs(errors["resampled"] - 0.1)
+
+
+def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
+    log = write(tmp_path)
+    plant = fit(Recording.read(log).select(), exact=True).options
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"measurement_covariances": [1.0, 1.0]}, "fit with --exact if it is one"),
+        ({"state_names": ["a", "z"]}, "state_names = .* channels of a, b"),
+        ({"measurement_matrices": [[0.0, 1.0], [1.0, 0.0]]}, "rows of the identity"),
+        ({"process_covariance": [[1.0, 1.0], [1.0, 1.0]]}, "process noise of its own"),
+        ({"horizon": 2000}, "1,500 steps of the log were not fitted"),
+        ({"true_process_noise": 2.0}, "the truth is the recording"),
+        ({"backend": "jax"}, "under JAX"),
+        ({"fit_share": 1.0}, "fit_share = 1.0"),
+    ]
+    for options, message in cases:
+        with pytest.raises(ConfigurationError, match=message):
+            fusion_gym.make_task(ENV, log=log, **{"tokens": "unlimited"} | plant | options)
+    with pytest.raises(ConfigurationError, match="source = 'resampled' is not allowed"):
+        fusion_gym.make_task(ENV, source="resampled")
+    with pytest.raises(ConfigurationError, match=r"transition = .* left out without a log"):
+        fusion_gym.make_task(ENV, transition=[[0.5]])
+
+
+def test_the_packaged_plant_is_fitted_to_the_packaged_log() -> None:
+    folder = Path(fusion_gym.__file__).parent / "recordings"
+    plant = fit(Recording.read(folder / "tanks.csv").select(), exact=True)
+    task = fusion_gym.make_task(ENV)
+    assert np.asarray(task.system.plant.transition[..., 0]) == pytest.approx(plant.transition)
+    assert task.noise is not None
+
+
+@pytest.mark.parametrize("source", ["recorded", "normal"])
+def test_filters_are_honest_on_the_made_up_log(source: str) -> None:
+    task = fusion_gym.make_task(ENV, source=source, tokens="unlimited")
+    for rule in ("never", "periodic:period=10", "periodic:period=4"):
+        results = run_episodes(task, fusion_gym.make_policy(rule, task), 29, 0)
+        exact = results.rate.mean() if source == "recorded" else 0.0  # a reading has no error
+        assert results.nees.mean() == pytest.approx(1.0 - exact, abs=0.12)
