@@ -129,6 +129,11 @@ def test_a_sensor_without_a_reading_does_nothing(tmp_path: Path) -> None:
         assert (batch.grantable() == present).all()
         value = batch.beliefs().value()
         assert np.abs(value[~present]).max(initial=0.0) < 1e-9
+        mean, covariance = task.system.single_deliveries(batch.state)
+        silent = task.system.deliver(batch.state, np.zeros((2, 30), dtype=np.bool_))
+        for sensor, run in np.argwhere(~present):
+            assert mean[sensor, :, run] == pytest.approx(silent.mean[:, run])
+            assert np.array_equal(covariance[sensor, ..., run], silent.covariance[..., run])
         outcome = batch.step(np.ones((2, 30), dtype=np.bool_))
         assert (outcome.granted == present).all()
         assert np.array_equal(outcome.cost, 3.0 * present.sum(0))
@@ -143,11 +148,17 @@ def test_a_sensor_without_a_reading_does_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("options", [{}, {"memory": True}, {"filter": "hold"}])
 def test_nothing_shows_the_future(options: dict[str, Any], tmp_path: Path) -> None:
     """Another future, gaps included, changes no observation and no signal before it."""
-    log, change = write(tmp_path, scatter), ROWS // 2 + 30
+    change = ROWS // 2 + 30
+
+    def gap(path: np.ndarray) -> None:
+        scatter(path)
+        path[change - 3 : change, 0] = np.nan
+
+    log = write(tmp_path, gap)
     task = make(log, **options)
 
     def other(path: np.ndarray) -> None:
-        scatter(path)
+        gap(path)
         path[change:] = np.roll(path[change:], 7, axis=0) + 1.0
 
     plant = fit(Recording.read(log).select(), exact=True, order=1).options

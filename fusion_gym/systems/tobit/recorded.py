@@ -184,11 +184,8 @@ class RecordedSystem(CensoredSystem):
         """See :class:`System`."""
         mean, covariance = super().single_deliveries(state)
         available, _ = self.available(state)
-        silent = self.deliver(state, np.zeros_like(available))
-        return (
-            np.where(available[:, None], mean, silent.mean),
-            np.where(available[:, None, None], covariance, silent.covariance),
-        )
+        silent = self.deliver(state, np.zeros_like(available)).covariance
+        return mean, np.where(available[:, None, None], covariance, silent)
 
     def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """Return the signals, measurements as readings."""
