@@ -30,9 +30,11 @@ from fusion_gym.evaluation.field_study import (
     METHODS,
     FieldStudy,
     MethodPoint,
+    at_rate,
     compare_with_practice,
     measure,
     point_of,
+    simulate_sizes,
 )
 from fusion_gym.output.data_card import draw_card
 from fusion_gym.output.field_report import FieldReport, draw_curves, write_report
@@ -85,8 +87,8 @@ class Field(Long):
         """Fit, tune, train, measure and report."""
         whole = Recording.read(self.log)
         recording = whole.select(self.channels)
-        inputs = {"log": Path(self.log).name, "target_rate": self.target_rate, "share": self.share,
-                  "channels": self.channels, "exact": self.exact}  # fmt: skip
+        inputs: dict[str, Any] = {"log": joblib.hash(whole.values), "target_rate": self.target_rate}
+        inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
         place = self.output / "study.json"
         if place.exists() and not self.resume:
             raise ConfigurationError(
@@ -166,10 +168,11 @@ def _measure(study: FieldStudy, name: str, path: Path, folder: Path, timesteps: 
 
 def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodPoint]:
     """Train a centralised scheduler, and measure it at five prices."""
-    pair = measure(study, "centralised")[1:4]
-    packets = [float(np.sum(point.rates, axis=1).mean()) for point in pair]
-    errors = [float(np.mean(point.errors)) for point in pair]
-    middle = abs((errors[0] - errors[2]) / (packets[2] - packets[0]))
+    few, many = (
+        simulate_sizes(study, "centralised", at_rate(study, "centralised", np.ones(1), factor))
+        for factor in (0.7 * study.rate, 1.4 * study.rate)
+    )
+    middle = (few[0] - many[0]) / (many[1] - few[1]) / len(study.shape)
     prices = [float(f"{middle * factor:.4g}") for factor in np.geomspace(1 / _PRICES, _PRICES, 5)]
     drawn: dict[str, Any] = {"cost_weight": "random", "price_range": [prices[0], prices[-1]]}
     free = {"tokens": "unlimited", "token_cost": 1.0, "horizon": study.horizon, "filter": "joint",

@@ -27,7 +27,8 @@ METHODS = {  # name: filter, and whether every sensor has its own threshold
     "silence used, one a sensor": ("truncated", True),
     "centralised": ("joint", False),
 }
-_SEED, _EPISODES, _TRIALS, _STEPS = 700_000_000, 32, 150, 9
+_SEED, _EPISODES, _TRIALS = 700_000_000, 32, 150
+_FAR, _NEAR, _CLOSE = 7.0, 1.5, 0.02  # reaches and tolerance of the logarithm of a common scale
 _QUIET, _BUSY = 0.6, 0.8  # changes of logarithms where one sensor speaks for the others
 _REACH = 3.0  # of the logarithm of a sensor's threshold, from the common scale
 _BLOCK = 5  # windows of a block of the bootstrap
@@ -105,18 +106,13 @@ class MethodResult:
 
 def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
     """Tune a method at the target rate, and measure it at rates around it."""
-    own = METHODS[name][1]
-    shape = np.array(study.shape)
-    if name == "centralised":
-        return [
-            point_at(study, name, at_rate(study, name, np.ones(1), study.rate * factor))
-            for factor in FACTORS
-        ]
-    if own:
-        start = np.log(at_rate(study, name, shape, study.rate))
+    shape = np.ones(1) if name == "centralised" else np.array(study.shape)
+    middle = at_rate(study, name, shape, study.rate)
+    if METHODS[name][1]:
+        start = np.log(middle)
 
         def objective(change: Array) -> float:
-            error, rate = _trial(study, name, np.exp(start + change))
+            error, rate = simulate_sizes(study, name, np.exp(start + change))
             apart = np.log(max(rate, 1e-3 * study.rate) / study.rate)
             return float(np.log(error) + 4.0 * apart**2)
 
@@ -127,11 +123,9 @@ def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
         bounds: Any = [(-_REACH, _REACH)] * len(shape)
         limits: Any = {"maxfev": _TRIALS, "xtol": 0.05, "ftol": 0.005}
         best = minimize(objective, first, method="Powell", bounds=bounds, options=limits)
-        shape = np.exp(start + best.x)
-    return [
-        point_at(study, name, at_rate(study, name, shape, study.rate * factor))
-        for factor in FACTORS
-    ]
+        middle = np.exp(start + best.x)
+    sizes = [at_rate(study, name, middle, study.rate * factor, _NEAR) for factor in FACTORS]
+    return [point_at(study, name, own) for own in sizes]
 
 
 def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[dict[str, Any], str]:
@@ -178,12 +172,20 @@ def point_of(
     )
 
 
-def at_rate(study: FieldStudy, name: str, shape: Array, rate: float) -> Array:
-    """Return sizes of this shape with the rate in simulation."""
-    low, high = np.log([1e-3, 1e3])
-    for _ in range(_STEPS + 4):
+def simulate_sizes(study: FieldStudy, name: str, sizes: Array) -> tuple[float, float]:
+    """Return error and rate in simulation, on the tuning episodes."""
+    options, rule = rule_of(study, name, sizes)
+    task = study.task(METHODS[name][0], study.source, **options)
+    results = run_episodes(task, make_policy(rule, task), _EPISODES, _SEED)
+    return float(results.error_cost.mean()), float(results.rate.mean())
+
+
+def at_rate(study: FieldStudy, name: str, shape: Array, rate: float, reach: float = _FAR) -> Array:
+    """Return sizes of this shape with the rate in simulation, within a factor exp(reach)."""
+    low, high, middle = -reach, reach, 0.0
+    while high - low > _CLOSE:
         middle = 0.5 * (low + high)
-        if _trial(study, name, np.exp(middle) * shape)[1] > rate:
+        if simulate_sizes(study, name, np.exp(middle) * shape)[1] > rate:
             low = middle
         else:
             high = middle
@@ -256,11 +258,3 @@ def _rate_at(errors: Array, rates: Array, error: float, places: NDArray[np.int64
         slope = (level[1] - level[0]) / (rate[1] - rate[0])
         return float(np.exp(rate[0] + (np.log(error) - level[0]) / min(slope, -1e-9)))
     return float(np.exp(np.interp(-np.log(error), -level, rate)))
-
-
-def _trial(study: FieldStudy, name: str, sizes: Array) -> tuple[float, float]:
-    """Return error and rate in simulation, on the tuning episodes."""
-    options, rule = rule_of(study, name, sizes)
-    task = study.task(METHODS[name][0], study.source, **options)
-    results = run_episodes(task, make_policy(rule, task), _EPISODES, _SEED)
-    return float(results.error_cost.mean()), float(results.rate.mean())
