@@ -18,7 +18,6 @@ from fusion_gym.evaluation.field_study import (
 )
 from tests.command_runs import refusal, succeed
 
-TANKS = str(Path(__file__).parent.parent / "fusion_gym/recordings/tanks.csv")
 STUDY = FieldStudy({}, rate=0.05, shape=(1.0, 1.0), horizon=50, source="normal")
 
 
@@ -55,7 +54,7 @@ def test_a_study_ends_in_the_settings_of_devices(
     monkeypatch.setattr(field_study, "_TRIALS", 4)
     monkeypatch.setattr(field_study, "_EPISODES", 8)
     folder = tmp_path / "field"
-    words = [TANKS, "--exact", "--output", str(folder), "--timesteps", "4000", "--workers", "1"]
+    words = ["tanks", "--exact", "--output", str(folder), "--timesteps", "4000", "--workers", "1"]
     printed = succeed("field", words).out
     settings = yaml.safe_load((folder / "devices.yaml").read_text())
     assert list(settings) == ["inflow", "middle", "outflow"]

@@ -21,8 +21,6 @@ from fusion_gym.recordings.fitting import (
 from fusion_gym.validation import ConfigurationError
 from tests.command_runs import refusal, succeed
 
-ROOT = Path(__file__).parent.parent
-LOGS, TANKS = ROOT / "examples/recordings", ROOT / "fusion_gym/recordings/tanks.csv"
 A = np.array([[0.92, 0.05, 0.0], [0.04, 0.9, 0.05], [0.0, 0.06, 0.93]])
 W = np.array([[1.0, 0.2, 0.0], [0.2, 0.8, 0.1], [0.0, 0.1, 0.5]])
 
@@ -151,7 +149,7 @@ def test_too_few_readings_are_refused(rows: int, share: float) -> None:
 
 
 def test_the_mast_has_errors_near_the_models() -> None:
-    own = Recording.read(LOGS / "mast.csv.xz").select()
+    own = Recording.read("mast").select()
     plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
     criticism = criticise(plant, values[rows:])
     assert all(RATIOS[0] <= row.ratio <= RATIOS[1] for row in criticism), criticism
@@ -160,12 +158,12 @@ def test_the_mast_has_errors_near_the_models() -> None:
 
 def test_the_option_file_is_a_plant_of_the_environment(tmp_path: Path) -> None:
     output = tmp_path / "tanks.yaml"
-    printed = succeed("fit", [str(TANKS), "--exact", "--output", str(output)])
+    printed = succeed("fit", ["tanks", "--exact", "--output", str(output)])
     assert "inflow, middle, outflow: order 1, fitted to 3,000 steps" in printed.out
     assert printed.err.count("warning") == 0, printed.err
     content = yaml.safe_load(output.read_text())
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", system=str(output))
     assert task.system.state_names == ("inflow", "middle", "outflow")
     assert np.asarray(content["transition"]) == pytest.approx(A, abs=0.04)
-    error = refusal("fit", [str(TANKS), "--channels", "lake"])
+    error = refusal("fit", ["tanks", "--channels", "lake"])
     assert "channels = 'lake' is not allowed: it must be some of inflow, middle" in error

@@ -247,8 +247,7 @@ def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_packaged_plant_is_fitted_to_the_packaged_log() -> None:
-    folder = Path(fusion_gym.__file__).parent / "recordings"
-    plant = fit(Recording.read(folder / "tanks.csv").select(), exact=True)
+    plant = fit(Recording.read("tanks").select(), exact=True)
     task = fusion_gym.make_task(ENV)
     assert np.asarray(task.system.plant.transition[..., 0]) == pytest.approx(plant.transition)
     assert task.noise is not None

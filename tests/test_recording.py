@@ -11,9 +11,6 @@ from fusion_gym.recordings import ChannelCard, Recording
 from fusion_gym.validation import ConfigurationError
 from tests.command_runs import refusal, succeed
 
-ROOT = Path(__file__).parent.parent
-LOGS, TANKS = ROOT / "examples/recordings", ROOT / "fusion_gym/recordings/tanks.csv"
-
 
 def log(rows: int = 60, **columns: object) -> pd.DataFrame:
     """Three channels of noise, or other columns, every ten minutes."""
@@ -196,7 +193,7 @@ def test_a_gap_leaves_steps_without_readings(tmp_path: Path) -> None:
 
 def test_the_mast_has_one_faulty_anemometer() -> None:
     """As other measures have it: correlation .76 with the median of its peers."""
-    recording = Recording.read(LOGS / "mast.csv.xz")
+    recording = Recording.read("mast")
     faults = {row.channel.name: row.fault for row in recording.card if row.fault}
     assert faults == {"Spd80mS": "disagrees with its peers"}
     assert card(recording, "Spd80mS").agreement == pytest.approx(0.76, abs=0.005)
@@ -206,7 +203,7 @@ def test_the_mast_has_one_faulty_anemometer() -> None:
 
 
 def test_selected_channels_have_no_readings_at_their_limits() -> None:
-    recording = Recording.read(TANKS)
+    recording = Recording.read("tanks")
     assert (recording.values["middle"] == 54.0).any()
     chosen = recording.select(["middle"])
     assert chosen.values["middle"].max() < 54.0
@@ -218,7 +215,7 @@ def test_selected_channels_have_no_readings_at_their_limits() -> None:
 
 def test_info_prints_the_card_and_draws_it(tmp_path: Path) -> None:
     picture = tmp_path / "card.png"
-    printed = succeed("info", [str(TANKS), "--picture", str(picture)]).out
+    printed = succeed("info", ["tanks", "--picture", str(picture)]).out
     assert "6,000 steps of 0 days 00:01:00" in printed
     assert "middle [cm]" in printed
     assert picture.stat().st_size > 10_000

@@ -53,6 +53,7 @@ LISTED = (
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
     Listed("fusion-gym search ", "minutes", "--generations 1"),
+    Listed("fusion-gym field ", "minutes"),
     Listed("tensorboard ", "serves until it is interrupted"),
 )
 READ = """

@@ -1,6 +1,6 @@
 r"""Say how rarely the sensors of a log may report, and what to type into them.
 
-    fusion-gym field examples/recordings/mast.csv.xz --exact --target-rate 0.05
+    fusion-gym field mast --exact --target-rate 0.05
 
 The first part of the log determines a plant. Rules are tuned and an agent is trained on the plant
 with resampled residuals, and measured on the rest of the log. The report compares them at equal
@@ -44,6 +44,7 @@ from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.recordings import Recording, fit
 from fusion_gym.recordings.fitting import criticise, deviations, noisy_channels, warnings_of
+from fusion_gym.recordings.recording import SHIPPED
 from fusion_gym.training.algorithms import settings
 from fusion_gym.training.config import (
     EnvironmentConfig,
@@ -65,7 +66,7 @@ class Field(Long):
     """Say how rarely the sensors of a log may report, and what to type into them."""
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
-    """The CSV file; fusion-gym info shows its data card."""
+    """The CSV file, or mast or tanks; fusion-gym info shows its data card."""
     target_rate: Annotated[float, Between(0.0, 0.5)] = 0.05
     """Packets a sensor and step at which rules are compared."""
     output: Annotated[Path, OutputFolder()] = Path("runs/field")
@@ -103,12 +104,12 @@ class Field(Long):
                 f"exact = False is not allowed with this log: {', '.join(names)} have measurement "
                 "noise, so their readings are no truth; give --exact if they are"
             )
+        log = self.log if self.log in SHIPPED else str(Path(self.log).absolute())
         values, rows = deviations(recording, self.share)
         complete = float(np.isfinite(values[:rows]).all(axis=1).mean())
         horizon = int(np.clip((len(values) - rows) // _WINDOWS, _SHORTEST, _LONGEST))
         study = FieldStudy(
-            options=plant.options | {"log": str(Path(self.log).absolute()),
-                                     "fit_share": self.share},
+            options=plant.options | {"log": log, "fit_share": self.share},
             rate=self.target_rate,
             shape=plant.typical_changes,
             horizon=horizon,

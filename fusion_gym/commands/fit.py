@@ -1,6 +1,6 @@
 r"""Fit a plant to a log of sensors, and write the option file that ``system=`` takes.
 
-    fusion-gym fit examples/recordings/mast.csv.xz --exact --output mast.yaml
+    fusion-gym fit mast --exact --output mast.yaml
     fusion-gym evaluate --env fusion_gym/LinearFusion-v2 --set system=mast.yaml
 
 Level and daily cycle of every channel are removed. The plant is a vector autoregression of the
@@ -36,7 +36,7 @@ class Fit(Command):
     """Fit a plant to a log of sensors, and write the option file that system= takes."""
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
-    """The CSV file; fusion-gym info shows its data card."""
+    """The CSV file, or mast or tanks; fusion-gym info shows its data card."""
     output: Annotated[Path, OutputFile(".yaml", ".yml")] = Path("plant.yaml")
     """The option file."""
     channels: tuple[str, ...] = ()

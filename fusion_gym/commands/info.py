@@ -2,10 +2,10 @@
 
     fusion-gym info fusion_gym/LinearFusion-v2
     fusion-gym info value_of_information
-    fusion-gym info examples/recordings/mast.csv.xz
+    fusion-gym info mast
 
-``fusion-gym list`` shows all names. A path is the CSV file of a log; its data card has rates, gaps,
-saturation and faults of the channels.
+``fusion-gym list`` shows all names. The path of a CSV file, ``mast`` and ``tanks`` are logs. The
+data card of a log has rates, gaps, saturation and faults of the channels.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,8 @@ class Info(Command):
         entries = catalogue()
         name = present_id(self.name)
         names = [entry for named in entries.values() for entry in named]
-        if name not in names and (Path(name).is_file() or ".csv" in Path(name).suffixes):
+        is_log = name in ("mast", "tanks") or ".csv" in Path(name).suffixes
+        if name not in names and (is_log or Path(name).is_file()):
             self._show_log()
             return
         if self.picture is not None:

@@ -2,7 +2,7 @@
 
 from fusion_gym.importing import require
 
-require("a recording", "recordings", "pandas", "statsmodels")
+require("a recording", "agents", "pandas", "statsmodels")
 
 from fusion_gym.recordings.fitting import Criticism, FittedPlant, criticise, fit  # noqa: E402
 from fusion_gym.recordings.recording import (  # noqa: E402

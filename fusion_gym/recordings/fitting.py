@@ -48,7 +48,7 @@ class FittedPlant:
 
     Example:
         >>> from fusion_gym.recordings import Recording, fit
-        >>> plant = fit(Recording.read("fusion_gym/recordings/tanks.csv").select(), exact=True)
+        >>> plant = fit(Recording.read("tanks").select(), exact=True)
         >>> plant.names, plant.order
         (('inflow', 'middle', 'outflow'), 1)
     """
@@ -202,7 +202,7 @@ def fit(
 
     Example:
         >>> from fusion_gym.recordings import Recording, fit
-        >>> fit(Recording.read("fusion_gym/recordings/tanks.csv").select(), exact=True).order
+        >>> fit(Recording.read("tanks").select(), exact=True).order
         1
     """
     share = number("share", share, above=0.0, at_most=0.95)

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, refusal
 
+# Shipped logs by name: three made-up tanks, and a wind mast (from brightwind 2.7.0, MIT).
+SHIPPED = {name: Path(__file__).with_name(f"{name}.csv{end}")
+           for name, end in (("tanks", ""), ("mast", ".xz"))}  # fmt: skip
 _HEAD = re.compile(
     r"(?P<name>[^\[\]]*[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?"
     r"(\s+(?P<low>-?[\d.]+)?\.\.(?P<high>-?[\d.]+)?)?"
@@ -70,7 +73,7 @@ class ChannelCard:
 
     Example:
         >>> from fusion_gym.recordings import Recording
-        >>> [card.fault for card in Recording.read("fusion_gym/recordings/tanks.csv").card]
+        >>> [card.fault for card in Recording.read("tanks").card]
         ['', '', '']
     """
 
@@ -99,7 +102,7 @@ class Recording:
 
     Example:
         >>> from fusion_gym.recordings import Recording
-        >>> recording = Recording.read("fusion_gym/recordings/tanks.csv")
+        >>> recording = Recording.read("tanks")
         >>> [channel.unit for channel in recording.channels]
         ['cm', 'cm', 'cm']
     """
@@ -118,14 +121,15 @@ class Recording:
         interval.
 
         Args:
-            path: the file; pandas also reads it compressed.
+            path: the file, which may be compressed, or the name of a shipped log: ``"tanks"`` or
+                ``"mast"``.
 
         Raises:
             ConfigurationError: the file cannot be read as a log.
         """
         if not isinstance(path, str | os.PathLike):
             raise refusal("log", path, "the path of a CSV file")
-        table, source = _table(Path(path)), f"log = {os.fspath(path)!r}"
+        table, source = _table(SHIPPED.get(str(path), Path(path))), f"log = {os.fspath(path)!r}"
         channels = [_channel(str(head), source) for head in table.columns[1:]]
         names = [channel.name for channel in channels]
         if len(set(names)) < len(names) or not names:

@@ -58,7 +58,7 @@ class RecordedFusionOptions(LinearFusionOptions):
     """
 
     log: str | None = None
-    """Path of the log, a CSV file; the default is the made-up log."""
+    """Path of the log, a CSV file, or the name of a shipped log: ``"mast"`` or ``"tanks"``."""
     fit_share: float = 0.5
     """Share of the log, from its start, that was fitted."""
     source: Literal["recorded", "resampled", "normal"] = "recorded"
@@ -300,7 +300,7 @@ def _part(log: str, modified: float, names: tuple[str, ...] | None, share: float
 
 def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     """Return the scenario of these options."""
-    require("a recording", "recordings", "pandas", "statsmodels")
+    require("a recording", "agents", "pandas", "statsmodels")
     from fusion_gym.recordings import FittedPlant
     from fusion_gym.recordings.fitting import noisy_channels
 
@@ -361,7 +361,7 @@ def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:
     options = parsed(read_text("system", path), str(path))
     if choice.state_weights is not None:
         options["state_weights"] = choice.state_weights
-    return replace(choice, log=str(folder / "tanks.csv"), **options)
+    return replace(choice, log="tanks", **options)
 
 
 def _filled(values: Array) -> Array:

@@ -1,6 +1,6 @@
 """Write fusion_gym/recordings/tanks.csv: levels of three tanks from a known plant.
 
-    python examples/recordings/tanks.py
+    python examples/tanks_log.py
 
 The third sensor reads every fourth minute, the second saturates at 54 cm, and 3 % of the readings
 are lost. A and W are the plant's matrices.
