@@ -26,9 +26,7 @@ def point(factor: float, error: float, spread: float = 0.0, windows: int = 40) -
     draw = np.random.default_rng(0).normal(size=windows)
     draw = spread * (draw - draw.mean())
     rates = [[0.05 * factor] * 2] * windows
-    return MethodPoint(
-        [1.0], error, 0.05 * factor, (error * (1.0 + draw)).tolist(), rates, [1.0, 1.0]
-    )
+    return MethodPoint([1.0], error, (error * (1.0 + draw)).tolist(), rates, [1.0, 1.0])
 
 
 def test_methods_are_compared_at_equal_packets_and_at_equal_error() -> None:

@@ -114,8 +114,8 @@ def headline_text(titles: dict[str, str], rows: Sequence[ClassRow]) -> str:
         for kind in ("trigger", "threshold", "agent")
     }
     text = (
-        "Negative: the agent is better. In the median class the own trigger, scaled, costs "
-        f"{medians['trigger']:+.1%} over the searched rule, the best rule with one threshold "
+        "Negative: the agent is better. In the median class the setting's own trigger, scaled, "
+        f"costs {medians['trigger']:+.1%} over the searched rule, the best rule with one threshold "
         f"{medians['threshold']:+.1%}, and an agent {medians['agent']:+.1%}."
     )
     return f"{table(head, cells)}\n\n{text.replace('-', '−')}"

@@ -131,7 +131,7 @@ class Field(Long):
             report = FieldReport(
                 name=Path(self.log).name, whole=whole, recording=recording, study=study,
                 rows=rows, criticism=criticism,
-                warnings=tuple(warnings_of(plant, values[rows:], criticism)),
+                warnings=(*plant.remarks, *warnings_of(plant, values[rows:], criticism)),
                 points=points, results=results,
             )  # fmt: skip
             print(write_report(report, self.output))

@@ -17,6 +17,7 @@ import yaml
 
 from fusion_gym.commands.command_line import Command
 from fusion_gym.commands.options import Between, OutputFile
+from fusion_gym.output.data_card import RATIOS, criticism_rows
 from fusion_gym.output.files import write_text
 from fusion_gym.output.progress import remark, writing
 from fusion_gym.output.tables import console, table_tables
@@ -53,13 +54,7 @@ class Fit(Command):
         values, rows = deviations(recording, self.share)
         criticism = criticise(plant, values[rows:])
         title = f"{', '.join(plant.names)}: order {plant.order}, fitted to {rows:,} steps"
-        lines = [
-            (f"{row.rate:g}", f"{row.real:.4f}", f"{row.model:.4f}", f"{row.ratio:.2f}",
-             f"{row.nees:.2f}")
-            for row in criticism
-        ]  # fmt: skip
-        heads = "packets a sensor and step", "real error", "model's error", "ratio", "NEES"
-        console().print(table_tables(title, heads, lines))
+        console().print(table_tables(title, RATIOS, criticism_rows(criticism)))
         white = residual_correlations(plant, values[rows:])
         text = ", ".join(f"{name} {value:.2f} (lag {lag})" for name, lag, value in white)
         print(f"largest correlations of residuals in ten lags: {text}")

@@ -71,7 +71,6 @@ class MethodPoint:
     Args:
         thresholds: threshold of each sensor, or one, or the price of an agent.
         simulated_error: error in the simulation that tuned it.
-        simulated_rate: packets a sensor and step there.
         errors: error of each window (W,), relative to the channels' variance.
         rates: packets a step of each window and sensor (W, sensors).
         deviations: root mean square error of each channel, in its unit.
@@ -79,7 +78,6 @@ class MethodPoint:
 
     thresholds: list[float]
     simulated_error: float
-    simulated_rate: float
     errors: list[float]
     rates: list[list[float]]
     deviations: list[float]
@@ -165,7 +163,6 @@ def point_of(
     return MethodPoint(
         sizes,
         float(simulated.error_cost.mean()),
-        float(simulated.rate.mean()),
         (scale * real.error_cost).tolist(),
         real.rate.tolist(),
         np.sqrt(squared).tolist(),

@@ -1,5 +1,6 @@
 """The data card of a recording: tables for the terminal, and a picture."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -9,12 +10,13 @@ from rich.table import Table
 from fusion_gym.output.figures import save_figure
 from fusion_gym.output.palette import BLUE, VERMILLION
 from fusion_gym.output.tables import table_tables
-from fusion_gym.recordings import ChannelCard, Recording
+from fusion_gym.recordings import ChannelCard, Criticism, Recording
 
 COLUMNS = (
     "channel", "readings", "missing", "every", "mean", "deviation", "resolution", "saturated",
     "stuck", "spikes", "agreement", "fault",
 )  # fmt: skip
+RATIOS = "packets a sensor and step", "real error", "plant's error", "ratio", "NEES"
 CAPTION = (
     "every: steps between two readings · stuck: readings in long runs of one value · agreement: "
     "correlation with the median of the channels of its unit"
@@ -24,6 +26,14 @@ CAPTION = (
 def card_table(recording: Recording) -> Table:
     """Return the table of the channels."""
     return table_tables("channels", COLUMNS, map(card_row, recording.card), CAPTION)
+
+
+def criticism_rows(criticism: Sequence[Criticism]) -> list[tuple[str, ...]]:
+    """Return the rows of ``RATIOS``."""
+    return [
+        (f"{r.rate:g}", f"{r.real:.4f}", f"{r.model:.4f}", f"{r.ratio:.2f}", f"{r.nees:.2f}")
+        for r in criticism
+    ]
 
 
 def card_lines(recording: Recording) -> list[str]:

@@ -17,7 +17,7 @@ from fusion_gym.evaluation.field_study import (
     MethodPoint,
     MethodResult,
 )
-from fusion_gym.output.data_card import COLUMNS, card_lines, card_row
+from fusion_gym.output.data_card import COLUMNS, RATIOS, card_lines, card_row, criticism_rows
 from fusion_gym.output.figures import save_figure
 from fusion_gym.output.files import write_text
 from fusion_gym.output.palette import READABLE
@@ -94,10 +94,6 @@ def write_report(report: FieldReport, folder: Path) -> str:
         '    "fusion_gym/LinearFusion-v2", system="plant.yaml", tokens="unlimited",\n'
         f'    filter="{filter_name}",{trigger}\n)\n```',
     ]
-    ratios = [
-        (f"{r.rate:g}", f"{r.real:.4f}", f"{r.model:.4f}", f"{r.ratio:.2f}", f"{r.nees:.2f}")
-        for r in report.criticism
-    ]
     text = [
         f"# {report.name}",
         f"By fusion-gym {__version__}.",
@@ -108,9 +104,7 @@ def write_report(report: FieldReport, folder: Path) -> str:
         "## The plant",
         f"A vector autoregression of the first {report.rows:,} steps without level and daily "
         "cycle, and its errors on the others under a periodic schedule.",
-        table(
-            ("packets a sensor and step", "real error", "plant's error", "ratio", "NEES"), ratios
-        ),
+        table(RATIOS, criticism_rows(report.criticism)),
         "\n".join(f"- Warning: {line}." for line in report.warnings) or "No warning.",
         "## The log",
         "\n".join(f"- {line}" for line in card_lines(whole)),
