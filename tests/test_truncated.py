@@ -55,6 +55,46 @@ def test_a_silent_update_is_the_truncation_by_quadrature(trigger: str) -> None:
         batch.step(sent)
 
 
+def test_two_silent_sensors_are_the_truncation_by_quadrature() -> None:
+    """Within half a hundredth of a deviation, beside a delivery and a threshold of zero."""
+    options = {
+        "measurement_matrices": [[[1.0, 0.0], [0.9, 0.3]], [[1.0, 0.2]], [[0.0, 1.0]]],
+        "measurement_covariances": [0.05, 0.1, 0.1],
+    }
+    runs, thresholds = 10, (0.6, 0.6, 0.8)
+    batch = EpisodeBatch.seeded(
+        make("report_on_change", (0.6, 0.8, 0.0), **options, **FREE), runs, 0
+    )
+    system = batch.task.system
+    sensors, line = system.centre.sensors, np.linspace(-7.0, 7.0, 201)
+    grid = np.stack(np.meshgrid(line, line)).reshape(2, -1)
+    rows = sensors.measurement_matrix.reshape(-1, 2)[[0, 1, 2, 4]]
+    deviations = sensors.deviation.reshape(-1)[[0, 1, 2, 4]]
+    for step in range(8):
+        state, sent = batch.state, np.zeros((3, runs), dtype=np.bool_)
+        sent[2] = step % 3 == 1
+        silent = system.deliver(state, sent)
+        for run in range(runs):
+            root = np.linalg.cholesky(state.prior_covariance[..., run])
+            x = state.prior_mean[:, run, None] + root @ grid
+            weight, z = norm.pdf(grid).prod(0), rows @ x
+            held = state.held.reshape(-1, runs)[[0, 1, 2, 4], run]
+            for row in range(3):
+                ends = [
+                    (held[row] + s * thresholds[row] - z[row]) / deviations[row] for s in (1, -1)
+                ]
+                weight *= norm.cdf(ends[0]) - norm.cdf(ends[1])
+            if sent[2, run]:
+                weight *= norm.pdf(state.measurement[2, 0, run], z[3], deviations[3])
+            weight /= weight.sum()
+            apart = x - (mean := x @ weight)[:, None]
+            whiten = np.linalg.inv(np.linalg.cholesky(apart * weight @ apart.T))
+            np.testing.assert_allclose(whiten @ (silent.mean[:, run] - mean), 0.0, atol=0.005)
+            spread = whiten @ silent.covariance[..., run] @ whiten.T
+            np.testing.assert_allclose(spread, np.eye(2), atol=0.006)
+        batch.step(sent | (np.arange(runs) % 4 == step % 4))
+
+
 def test_silence_of_a_lossy_source_is_a_mixture_by_quadrature() -> None:
     """Inside the interval silence is certain, outside it has the probability of a loss."""
     options = {"channel": "independent", "drop_probability": 0.3, "coefficient": 0.9}

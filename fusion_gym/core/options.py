@@ -129,7 +129,8 @@ class CommonOptions:
     of the sustained rate, but at least two packets per sensor and episode."""
     state_weights: ArrayLike | None = None
     """Weights of the states' squared errors in the reward. The default is the environment's own,
-    which ``help`` shows."""
+    which ``help`` shows. Explicit weights also weigh the trace that covariance intersection
+    minimises, which is plain by default."""
     reward_scale: float | Literal["auto"] | None = "auto"
     """Factor of the state weights. ``"auto"`` simulates a moderate policy and takes the factor with
     which its error costs 1 per step; explicit ``state_weights`` are not scaled. That policy

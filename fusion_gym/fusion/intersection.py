@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
+from fusion_gym.fusion.rules import Active, Fused, SmallestTrace, own_covariances
 from fusion_gym.validation import refusal
 
 _ORTHOGONAL = 1e-13  # cosine below which two rows count as orthogonal
@@ -350,7 +350,7 @@ def inverse_covariance_intersection(
 
 
 @dataclass(frozen=True)
-class SequentialIntersection(FusionRule):
+class SequentialIntersection(SmallestTrace):
     r"""Join the first estimate with each other one in turn, two at a time.
 
     In each run the first active estimate is the start of the sequence.
@@ -384,7 +384,7 @@ class SequentialIntersection(FusionRule):
         X\right),\qquad L=P_{\mathrm{new}}\left(P_i^{-1}-(1-\omega)X\right)
         $$
 
-        Each ω minimises the trace; K + L = I.
+        Each ω minimises the trace, weighted by ``state_weights``; K + L = I.
 
     Assumes: the assumption of ``join`` at every step.
 
@@ -405,6 +405,7 @@ class SequentialIntersection(FusionRule):
     ) -> Fused:
         """Return the fused active estimates."""
         own = own_covariances(covariance)
+        basis = self.metric(own, basis)
         count, _, runs = means.shape
         self._check_order(count)
         selected = np.ones((count, runs), dtype=np.bool_) if active is None else active

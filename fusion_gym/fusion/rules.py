@@ -6,8 +6,9 @@ A new rule is a subclass of :class:`FusionRule` and a row of the table in
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,10 @@ class FusionRule(ABC):
                 minimise the trace of G P Gᵀ. The identity by default.
         """
 
+    def with_weights(self, state_weights: Array | None) -> Self:
+        """Return the rule for a trace with the weights (n,) of the states, if it uses a trace."""
+        return self
+
     def fuse_single(
         self, silent: Array, delivered: Array, basis: Array | None = None
     ) -> tuple[Array, Array]:
@@ -87,6 +92,26 @@ class FusionRule(ABC):
             covariances[node] = delivered[node]
             single[node] = self.fuse(nowhere, covariances, basis=basis).covariance
         return self.fuse(nowhere, silent, basis=basis).covariance, single
+
+
+@dataclass(frozen=True)
+class SmallestTrace(FusionRule):
+    """A rule whose result has the smallest trace Σ w_i P_ii; ``state_weights`` w (n,), or all 1."""
+
+    state_weights: Array | None = field(default=None, kw_only=True)
+
+    def with_weights(self, state_weights: Array | None) -> Self:
+        """See :class:`FusionRule`; weights that are all zero count as all 1."""
+        some = state_weights is not None and state_weights.any()
+        return replace(self, state_weights=state_weights if some else None)
+
+    def metric(self, covariance: Array, basis: Array | None) -> Array | None:
+        """Return √W G (n, n, N) of the trace of (√W G) P (√W G)ᵀ; ``None`` for the identity."""
+        if self.state_weights is None:
+            return basis
+        plain = linalg.identity(len(self.state_weights)) if basis is None else basis
+        weighted = np.sqrt(self.state_weights)[:, None, None] * plain
+        return np.broadcast_to(weighted, covariance.shape[-3:])
 
 
 def own_covariances(covariance: Array) -> Array:

@@ -20,7 +20,7 @@ from fusion_gym.fusion.intersection import (
     information_fusion,
     orthonormalise,
 )
-from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
+from fusion_gym.fusion.rules import Active, Fused, SmallestTrace, own_covariances
 
 _GAP = 1e-6  # relative optimality gap at which the search ends
 _STEPS = 100  # largest number of steps; most runs need 4, ill-conditioned ones about 30
@@ -29,12 +29,12 @@ _RIDGE = 1e-10  # keeps the curvature invertible where estimates are alike
 
 
 @dataclass(frozen=True)
-class CovarianceIntersection(FusionRule):
+class CovarianceIntersection(SmallestTrace):
     r"""Covariance intersection of all estimates at once (:func:`covariance_intersection_many`).
 
     Like its sequential form it bounds the actual covariance for every correlation of the errors.
     A single active estimate is returned unchanged. The smallest trace depends on the units of the
-    states: a state in a smaller unit has larger numbers and a larger weight.
+    states, unless ``state_weights`` weigh them as the reward does.
 
     Equation:
         $$
@@ -59,6 +59,7 @@ class CovarianceIntersection(FusionRule):
     ) -> Fused:
         """Return the fused active estimates."""
         own = own_covariances(covariance)
+        basis = self.metric(own, basis)
         if active is None:
             return covariance_intersection_many(means, own, basis=basis)
         first = active.argmax(0)

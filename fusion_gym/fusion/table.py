@@ -8,6 +8,7 @@ from typing import Any, Literal
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
+from fusion_gym.arrays import Array
 from fusion_gym.fusion.intersection import (
     SequentialIntersection,
     covariance_intersection,
@@ -83,7 +84,7 @@ RULES = {
     "ci": FusionRow(
         CovarianceIntersection,
         "nothing",
-        "Covariance intersection of all: a bound. Its weights depend on the states' units.",
+        "Covariance intersection of all: a bound. Explicit ``state_weights`` weigh its trace.",
         cubic=True,
     ),
     "exact_ci": FusionRow(
@@ -125,7 +126,11 @@ class Structure:
 
 
 def choose_rule(
-    name: Any, structure: Structure, sensors: int, order: ArrayLike | None = None
+    name: Any,
+    structure: Structure,
+    sensors: int,
+    order: ArrayLike | None = None,
+    state_weights: Array | None = None,
 ) -> FusionRule:
     """Return the rule of the options ``fusion`` and ``order``.
 
@@ -134,6 +139,7 @@ def choose_rule(
         structure: Structure of the estimates' errors.
         sensors: Number of sensors.
         order: Order of arrival of the sensors; the centre's prediction precedes them.
+        state_weights: Weights (n,) of the trace that the rule minimises; by default all 1.
 
     Raises:
         ConfigurationError: The rule is unknown, refused for this structure or this number of
@@ -161,14 +167,16 @@ def choose_rule(
             f"number{instead}"
         )
     if order is None:
-        return rule.make()
+        return rule.make().with_weights(state_weights)
     if not rule.ordered:
         raise ConfigurationError(
             f"order = {validation.display(order)} is not allowed with fusion={name!r}: it belongs "
             "to the sequential rules 'sici' and 'sci'"
         )
     arrival = _arrival(order, sensors)
-    return rule.make(order=(0, *(i + 1 for i in arrival)) if structure.prediction else arrival)
+    if structure.prediction:
+        arrival = (0, *(i + 1 for i in arrival))
+    return rule.make(order=arrival).with_weights(state_weights)
 
 
 def _arrival(order: ArrayLike, sensors: int) -> tuple[int, ...]:

@@ -107,12 +107,10 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     horizon = validation.horizon(options.horizon)
     plant, sensors = _plant_and_sensors(options)
     open_loop = plant.open_loop(horizon)
-    equal = equal_weights(open_loop)
-    weights = (
-        equal
-        if options.state_weights is None
-        else validation.not_negative("state_weights", options.state_weights, open_loop.shape)
-    )
+    chosen = options.state_weights
+    if chosen is not None:
+        chosen = validation.not_negative("state_weights", chosen, open_loop.shape)
+    weights = equal_weights(open_loop) if chosen is None else chosen
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
     if options.track_actual:
@@ -120,7 +118,7 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     system = CorrelatedTrackingSystem(
         plant=plant,
         filter=RobustKalmanFilter(sensors),
-        fusion=choose_rule(options.fusion, _STRUCTURE, sensors.count, options.order),
+        fusion=choose_rule(options.fusion, _STRUCTURE, sensors.count, options.order, chosen),
         noise_scale=_noise_scale(options.noise_scale),
         state_names=_state_names(plant.size),
         state_weights=weights,

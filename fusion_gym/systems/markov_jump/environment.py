@@ -173,7 +173,7 @@ def _system(
 ) -> MarkovJumpSystem | MarkovJumpCentralSystem:
     """Return the system of a filter and a fusion rule."""
     names = _state_names(plant.size)
-    fusion = _fusion(kind, where, sensors.count)
+    fusion = _fusion(kind, where, sensors.count, weights)
     if fusion is None:
         return MarkovJumpCentralSystem.create(
             plant, sensors, where == "imm", names, weights, horizon, nature
@@ -181,7 +181,7 @@ def _system(
     return MarkovJumpSystem.create(plant, sensors, fusion, names, weights, horizon, nature)
 
 
-def _fusion(kind: str | None, where: str, sensors: int) -> FusionRule | None:
+def _fusion(kind: str | None, where: str, sensors: int, weights: Array | None) -> FusionRule | None:
     """Return the rule that joins the nodes' estimates, or None for a filter at the centre."""
     if where != "local":
         if kind is not None:
@@ -190,7 +190,8 @@ def _fusion(kind: str | None, where: str, sensors: int) -> FusionRule | None:
                 "because the centre fuses no estimates; it belongs to filter='local'"
             )
         return None
-    return choose_rule("matrix" if kind is None else kind, _STRUCTURE, sensors)
+    kind = "matrix" if kind is None else kind
+    return choose_rule(kind, _STRUCTURE, sensors, state_weights=weights)
 
 
 def _state_names(size: int) -> tuple[str, ...]:

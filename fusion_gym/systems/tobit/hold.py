@@ -20,14 +20,15 @@ from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 @dataclass(frozen=True)
 class HoldCentre(Centre):
-    r"""Least squares of the held values, without a filter.
+    r"""Least squares of the held values, weighted by the noises, without a filter.
 
     The covariance is the mean squared error by the model. It follows the second moment Σ of (x, d),
     with d = C x - ȳ what happened since the deliveries.
 
     Equation:
         $$
-        \hat x=C^{+}\bar y,\qquad P=C^{+}\,\Sigma_{dd}\,(C^{+})^{\mathsf T}
+        \hat x=C^{+}\bar y,\qquad C^{+}=(C^{\mathsf T}R^{-1}C)^{-1}C^{\mathsf T}R^{-1},\qquad
+        P=C^{+}\,\Sigma_{dd}\,(C^{+})^{\mathsf T}
         $$
 
         $$
@@ -35,8 +36,9 @@ class HoldCentre(Centre):
         C\end{pmatrix}^{\mathsf T},\qquad F=\begin{pmatrix}A&0\\C(A-I)&I\end{pmatrix}
         $$
 
-        ȳ and C stack the last delivered values of all sensors and their matrices. A delivery of
-        sensor i sets d_i = -v_i: its rows and columns of Σ become zero but for the covariance R_i.
+        ȳ, C and R stack the last delivered values, matrices and variances of all sensors. A
+        delivery of sensor i sets d_i = -v_i: its rows and columns of Σ become zero but for the
+        covariance R_i.
 
     Assumes: deliveries at times that do not depend on the values, for P; and sensors that together
     determine the state.
@@ -55,8 +57,9 @@ class HoldCentre(Centre):
     @functools.cached_property
     def inverse(self) -> Array:
         """C⁺ (n, channels, 1)."""
-        inverse = np.linalg.pinv(self.sensors.stacked_matrix[..., 0])
-        return np.asarray(inverse, dtype=np.float64)[..., None]
+        matrix, size, deviation = _unit_free(self.sensors)
+        inverse: Array = np.linalg.pinv(matrix) / size[:, None] / deviation
+        return inverse[..., None]
 
     @functools.cached_property
     def motion(self) -> tuple[Array, Array]:
@@ -126,6 +129,15 @@ class HoldCentre(Centre):
         return linalg.congruence(self.inverse, moment[n:, n:])
 
 
+def _unit_free(sensors: CensoredSensors) -> tuple[Array, Array, Array]:
+    """Return R^-½ C S⁻¹ (channels, n), S (n,) that makes its columns of length 1, and √R."""
+    deviation = sensors.deviation.reshape(-1)
+    matrix = sensors.stacked_matrix[..., 0] / deviation[:, None]
+    size = np.sqrt((matrix * matrix).sum(0))
+    size = np.where(size > 0.0, size, 1.0)
+    return matrix / size, size, deviation
+
+
 def hold_centre(
     options: FeedbackOptions, sensors: CensoredSensors, plant: LinearPlant
 ) -> HoldCentre:
@@ -141,7 +153,7 @@ def hold_centre(
             determine the state.
     """
     refuse_fusion(options, "hold")
-    rank = int(np.linalg.matrix_rank(sensors.stacked_matrix[..., 0]))
+    rank = int(np.linalg.matrix_rank(_unit_free(sensors)[0]))
     if rank < plant.size:
         raise ConfigurationError(
             f"filter = 'hold' is not allowed with measurement_matrices of rank {rank}: together "

@@ -120,9 +120,10 @@ class LinearFusionOptions(FeedbackOptions):
     """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
     ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
     assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
-    is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the least-squares state
-    of the last delivered values, without a filter. ``"truncated"`` is one Kalman filter at the
-    centre that uses the silence of the policy ``trigger``; other policies are refused."""
+    is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the state that fits the
+    last delivered values best, weighted by their noises, without a filter. ``"truncated"`` is one
+    Kalman filter at the centre that uses the silence of the policy ``trigger``; other policies are
+    refused."""
     trigger: Trigger | None = None
     """Policy whose silence ``filter="truncated"`` uses."""
     trigger_threshold: ArrayLike | None = None

@@ -24,7 +24,7 @@ from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, Stochasti
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import choice
+from fusion_gym.validation import choice, not_negative
 
 _OF_FUSION = ("fusion", "information_shares", "order")
 _STRUCTURE = Structure(
@@ -177,7 +177,10 @@ def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
     """
     sensors = node.sensors.count
     kind = "federated" if options.fusion is None else options.fusion
-    fusion = choose_rule(kind, _STRUCTURE, sensors, options.order)
+    weights, states = options.state_weights, node.sensors.measurement_matrix.shape[2]
+    if weights is not None:
+        weights = not_negative("state_weights", weights, (states,))
+    fusion = choose_rule(kind, _STRUCTURE, sensors, options.order, weights)
     if kind == "federated":
         feedback = Feedback.in_shares(options.information_shares, sensors)
         if isinstance(node, KalmanFilter):

@@ -144,7 +144,8 @@ class AssumedDensityFilter:
         $$
 
         One scalar measurement after another. At an upper threshold the signs of t and of the step
-        are mirrored.
+        are mirrored. Where measurements are censored the order of the sensors changes the mean
+        error by some thousandths.
 
     Assumes: a linear plant, Gaussian noises, and a posterior that is nearly Gaussian;
     transmissions are not chosen by the noise.

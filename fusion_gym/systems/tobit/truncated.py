@@ -23,35 +23,47 @@ from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.options import refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
+_ROUNDS = 2  # a third changes errors by less than a thousandth
+_LEAST_SHARE = 1e-9  # of a variance; the rest of the difference is rounding
+
 
 @dataclass(frozen=True)
 class TruncatedCentre(FederatedCentre):
     r"""Kalman filter for which silence is a measurement in an interval, by moment matching.
 
-    The centre processes the deliveries first, then each channel of the silent sensors. A channel's
-    prediction is truncated to the interval that its trigger leaves silent, and the posterior of the
-    truncation is taken to be Gaussian.
+    The centre processes the deliveries first, and then all channels of silent sensors together by
+    expectation propagation: each silence stands for a Gaussian measurement that has the moments of
+    the truncation, given the deliveries and the other silences. Two rounds take all channels at
+    once, so the order of the sensors has no effect. With one silent channel the first has the exact
+    moments.
 
     Equation:
         $$
-        \text{silent:}\quad y\in(c-\theta,\ c+\theta),\qquad S=C P C^{\mathsf T}+R,\qquad
-        z=\frac{y-C\hat x}{\sqrt S}
+        \text{silent:}\quad y\in(c-\theta,\ c+\theta),\qquad s=C P_{\setminus}C^{\mathsf T},\quad
+        S=s+R,\qquad z=\frac{y-C\hat x_{\setminus}}{\sqrt S}
         $$
 
         $$
-        \hat x^{+}=\hat x+\frac{P C^{\mathsf T}}{\sqrt S}\,\mathrm E[z],\qquad
-        P^{+}=P-\frac{P C^{\mathsf T}C P}{S}\,(1-\mathrm{var}\,z)
+        \tau=\frac{1-\mathrm{var}\,z}{R+s\,\mathrm{var}\,z},\qquad
+        \nu=\tau\,C\hat x_{\setminus}+\frac{\sqrt S\,\mathrm E[z]}{R+s\,\mathrm{var}\,z}
+        $$
+
+        $$
+        P^{+}=\Bigl(P^{-1}+\sum\tau\,C^{\mathsf T}C\Bigr)^{-1},\qquad
+        \hat x^{+}=P^{+}\Bigl(P^{-1}\hat x+\sum\nu\,C^{\mathsf T}\Bigr)
         $$
 
         z is a standard normal truncated to the interval (c - θ, c + θ) of
-        :class:`~fusion_gym.systems.silence.Silence`. A silent sensor whose request the tokens would
-        not have paid for gives no information.
+        :class:`~fusion_gym.systems.silence.Silence`, τ and ν are precision and information of the
+        channel's measurement, and x̂∖ and P∖ are the estimate without that measurement. A silent
+        sensor whose request the tokens would not have paid for gives no information.
 
     Assumes: a linear plant, Gaussian noises, uncensored sensors, the trigger of the option
     ``trigger`` with this threshold and without a min_interval.
 
     Source: J. Sijs and M. Lazar, "Event based state estimation with time synchronous updates",
-    IEEE Trans. Automatic Control 57, 2012.
+    IEEE Trans. Automatic Control 57, 2012; T. P. Minka, "Expectation propagation for approximate
+    Bayesian inference", Uncertainty in Artificial Intelligence 17, 2001.
     """
 
     silence: Silence
@@ -90,21 +102,44 @@ class TruncatedCentre(FederatedCentre):
         mean, covariance = super().update(prior, prediction, measurement, granted)
         silent = ~granted if prediction.possible is None else ~granted & prediction.possible
         silent = silent & (self.silence.threshold > 0.0)
+        if not silent.any():
+            return mean, covariance
         middle = self.silence.middle(prediction.held, prediction.expectation.value)
-        for sensor in np.flatnonzero(silent.any(-1)):
-            for channel in range(self.sensors.size):
-                row = self.sensors.measurement_matrix[sensor, channel]
-                across = linalg.matvec(covariance, row)
-                variance = (row * across).sum(0) + self.sensors.variance[sensor, channel]
-                deviation = np.sqrt(variance)
-                shift = middle[sensor, channel] - (row * mean).sum(0)
-                first, second = self.silence.moments(
-                    self.silence.threshold[sensor], shift, deviation, 0.0
-                )
-                gain = np.where(silent[sensor], across / deviation, 0.0)
-                mean = mean + gain * first
-                covariance = covariance - (1.0 - second) * linalg.outer(gain, gain)
-        return mean, covariance
+        shift = middle - linalg.matvec(self.sensors.measurement_matrix, mean)
+        root = linalg.root(covariance)
+        z, posterior = self._truncate(root, shift, silent)
+        some = silent.any(0)
+        mean = np.where(some, mean + linalg.matvec(root, z), mean)
+        return mean, np.where(some, linalg.congruence(root, posterior), covariance)
+
+    def _truncate(self, root: Array, shift: Array, silent: Packets) -> tuple[Array, Array]:
+        """Return mean and covariance of z, x = x̂ + G z, given that measurements are silent.
+
+        Args:
+            root: G (n, n, N).
+            shift: c - C x̂ (sensors, m, N).
+            silent: (sensors, N).
+        """
+        sensors = self.sensors
+        matrix = linalg.matmul(sensors.stacked_matrix, root)
+        noise = sensors.variance.reshape(-1, 1)
+        threshold = np.repeat(self.silence.threshold, sensors.size, axis=0)
+        middle, silent = shift.reshape(noise.shape[0], -1), np.repeat(silent, sensors.size, axis=0)
+        precision = information = np.zeros(silent.shape)
+        z, posterior = np.zeros(root.shape[1:]), linalg.identity(len(root))
+        for _ in range(_ROUNDS if len(noise) > 1 else 1):
+            spread = linalg.dot(linalg.matmul(matrix, posterior), matrix)
+            left = np.maximum(1.0 - precision * spread, _LEAST_SHARE)
+            own, variance = (linalg.matvec(matrix, z) - spread * information) / left, spread / left
+            deviation = np.sqrt(variance + noise)
+            first, second = self.silence.moments(threshold, middle - own, deviation, 0.0)
+            rest = noise + variance * second
+            precision = np.where(silent, (1.0 - second) / rest, 0.0)
+            information = precision * own + np.where(silent, deviation * first / rest, 0.0)
+            weighted = linalg.matmul(linalg.transpose(precision[:, None] * matrix), matrix)
+            posterior = linalg.inverse(linalg.identity(len(root)) + weighted)
+            z = linalg.matvec(posterior, linalg.matvec(linalg.transpose(matrix), information))
+        return z, posterior
 
 
 def truncated_centre(options: Any, sensors: CensoredSensors) -> TruncatedCentre:

@@ -283,7 +283,11 @@ def _nodes(
     )
     joint = JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
-    fusion = NodeFusion(rule, plant.size, tracked=options.fusion == "ci")
+    weights = options.state_weights
+    if weights is not None:
+        size = plant.size + plant.inputs
+        weights = validation.not_negative("state_weights", weights, (size,))
+    fusion = NodeFusion(rule, plant.size, options.fusion == "ci", weights)
     hold = options.hold_variance
     if hold is not None and kind != "random_walk":
         raise ConfigurationError(

@@ -45,6 +45,7 @@ class NodeFusion(FusionRule):
     rule: FusionRule
     states: int
     tracked: bool = False
+    state_weights: Array | None = None
     weights: Array | None = None
 
     def start(self, nodes: int, runs: int) -> Array | None:
@@ -63,8 +64,10 @@ class NodeFusion(FusionRule):
         The covariance has zero blocks between state and input. Tracked weights are the state's.
         """
         n, own = self.states, own_covariances(covariance)
-        state = self._block(means[:, :n], own[:, :n, :n], active)
-        inputs = self._block(means[:, n:], own[:, n:, n:], active)
+        part = self.state_weights
+        every = (None, None) if part is None else (part[:n], part[n:])
+        state = self._block(means[:, :n], own[:, :n, :n], active, every[0])
+        inputs = self._block(means[:, n:], own[:, n:, n:], active, every[1])
         joint = np.zeros(own.shape[1:])
         joint[:n, :n], joint[n:, n:] = state.covariance, inputs.covariance
 
@@ -76,19 +79,22 @@ class NodeFusion(FusionRule):
         mean = np.concatenate((state.mean, inputs.mean))
         return Fused(mean, joint, gains, state.weights if self.tracked else None)
 
-    def _block(self, means: Array, own: Array, active: NDArray[np.bool_] | None) -> Fused:
+    def _block(
+        self, means: Array, own: Array, active: NDArray[np.bool_] | None, state: Array | None
+    ) -> Fused:
+        rule = self.rule.with_weights(state)
         if active is not None:
-            return self.rule.fuse(means, own, active)
+            return rule.fuse(means, own, active)
         ones = np.ones((1, means.shape[-1]))
         if len(means) == 1:
             identity = linalg.identity(means.shape[1]) * ones
             return Fused(means[0], own[0], lambda: identity[None], ones)
-        if isinstance(self.rule, CovarianceIntersection):
+        if isinstance(rule, CovarianceIntersection):
             if means.shape[1] == 1:
                 return _smallest_variance(means, own)
             if self.weights is not None:
-                return tracked_intersection(means, own, self.weights)
-        return self.rule.fuse(means, own)
+                return tracked_intersection(means, own, self.weights, rule.metric(own, None))
+        return rule.fuse(means, own)
 
 
 def _smallest_variance(mean: Array, covariance: Array) -> Fused:
@@ -101,7 +107,9 @@ def _smallest_variance(mean: Array, covariance: Array) -> Fused:
 
 
 @np.errstate(all="ignore")
-def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fused:
+def tracked_intersection(
+    mean: Array, covariance: Array, weights: Array, basis: Array | None = None
+) -> Fused:
     """Return the covariance intersection with weights that follow the smallest trace over time.
 
     From the given weights (l, N), w_i ← w_i √tr(P Y_i P), normalised, with Y_i = P_i⁻¹ and P = (Σ
@@ -114,6 +122,7 @@ def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fuse
         mean: (l, n, N).
         covariance: (l, n, n, N), symmetric positive semi-definite.
         weights: (l, N), not negative, of sum 1.
+        basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
     """
     information = linalg.inverse(covariance)
     nodes, n = mean.shape[:2]
@@ -128,9 +137,11 @@ def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fuse
         fused[..., lanes] = bound
         if step == _STEPS - 1:
             break
-        square = linalg.matmul(bound, bound)
+        metric = None if basis is None else basis[..., lanes]
+        spread = bound if metric is None else linalg.matmul(bound, linalg.transpose(metric))
+        square = linalg.matmul(spread, linalg.transpose(spread))
         gain = sum_rows((part * square).reshape(nodes, n * n, -1).swapaxes(0, 1))
-        total = linalg.trace(bound)
+        total = linalg.trace(bound if metric is None else linalg.matmul(metric, spread))
         still = gain.max(0) > (1.0 + _GAP) * total
         if not still.any():
             break
@@ -140,7 +151,8 @@ def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fuse
     joined = linalg.matvec(fused, sum_rows(weights[:, None] * vectors))
     lanes = np.flatnonzero(~is_regular(covariance, information).all(0))
     if lanes.size:
-        best = covariance_intersection_many(mean[..., lanes], covariance[..., lanes])
+        own = None if basis is None else basis[..., lanes]
+        best = covariance_intersection_many(mean[..., lanes], covariance[..., lanes], basis=own)
         joined[:, lanes], fused[..., lanes], weights[:, lanes] = (
             best.mean,
             best.covariance,
