@@ -101,9 +101,9 @@ class SmallestTrace(FusionRule):
     state_weights: Array | None = field(default=None, kw_only=True)
 
     def with_weights(self, state_weights: Array | None) -> Self:
-        """See :class:`FusionRule`; weights that are all zero count as all 1."""
-        some = state_weights is not None and state_weights.any()
-        return replace(self, state_weights=state_weights if some else None)
+        """See :class:`FusionRule`; equal weights leave the plain trace."""
+        differ = state_weights is not None and np.ptp(state_weights) > 0.0
+        return replace(self, state_weights=state_weights if differ else None)
 
     def metric(self, covariance: Array, basis: Array | None) -> Array | None:
         """Return √W G (n, n, N) of the trace of (√W G) P (√W G)ᵀ; ``None`` for the identity."""
