@@ -185,6 +185,15 @@ def test_seconds_are_times(tmp_path: Path) -> None:
     assert str(recording.values.index[0]) == "2023-11-14 22:13:20"
 
 
+@pytest.mark.parametrize("beside", [False, True])
+def test_the_first_reading_at_a_time_counts(beside: bool, tmp_path: Path) -> None:
+    """In the order of the file: beside each other, or where the times begin anew."""
+    table = log(600)
+    twice = pd.concat([table, table.assign(**{f"{name} [m]": 9.0 for name in "abc"})])
+    twice = twice.sort_index(kind="stable") if beside else twice
+    assert np.array_equal(read(twice, tmp_path).values, table.iloc[:, 1:])
+
+
 def test_a_gap_leaves_steps_without_readings(tmp_path: Path) -> None:
     recording = read(log().drop(index=range(20, 30)), tmp_path)
     assert len(recording.values) == 60
