@@ -107,6 +107,39 @@ def test_a_second_lag_is_fitted_where_it_helps() -> None:
     assert not task.reward.state_weights[3:].any()
 
 
+def test_the_order_is_chosen_on_rows_that_were_not_fitted() -> None:
+    """The second lag ends with the fitted two thirds, and is of no use after them."""
+    draw, path = np.random.default_rng(0).normal(size=2400), np.zeros((2400, 1))
+    for row in range(2, 2400):
+        lags = (1.2, -0.6) if row < 800 else (0.75, 0.0)
+        path[row] = lags @ path[[row - 1, row - 2]] + draw[row]
+    assert fit(recording(path), exact=True).order == 1
+
+
+def test_an_explosive_fit_is_damped_and_has_the_residuals_of_its_regression() -> None:
+    """Least squares by definition: W with n - k degrees of freedom, all poles times one factor."""
+    path = 1.02 ** np.arange(800)[:, None] + np.random.default_rng(0).normal(size=(800, 1))
+    plant = fit(recording(path), exact=True, order=2)
+    values = deviations(recording(path), 0.5)[0][:400, 0]
+    lags = np.stack([values[1:-1], values[:-2]], axis=1)
+    coefficients, squares, *_ = np.linalg.lstsq(lags, values[2:])
+    assert plant.process_covariance[0, 0] == pytest.approx(float(squares[0]) / (398 - 2), rel=1e-9)
+    poles = np.sort_complex(np.roots([1.0, *-coefficients]))
+    assert np.abs(poles).max() > 1.001
+    damped = np.sort_complex(np.linalg.eigvals(plant.transition))
+    assert damped == pytest.approx(poles * 0.9999 / np.abs(poles).max(), rel=1e-9)
+
+
+def test_changes_and_weights_have_a_closed_form() -> None:
+    """Two channels x' = a x + w: a change in ten steps has variance 2 P (1 - a^10)."""
+    a, variance = np.array([0.9, 0.5]), np.array([4.0, 9.0])
+    plant = FittedPlant(
+        ("a", "b"), np.diag(a), np.diag(variance * (1.0 - a**2)), np.full(2, 1e-6), 1
+    )
+    assert plant.typical_changes == pytest.approx(np.sqrt(2.0 * variance * (1.0 - a**10)))
+    assert plant.options["state_weights"] == pytest.approx(1.0 / variance / 2.0)
+
+
 def test_residuals_of_too_few_lags_are_not_white() -> None:
     own = recording(simulate(20_000, second=-0.5 * np.eye(3)))
     values, rows = deviations(own, 0.5)

@@ -11,11 +11,12 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.recordings import Recording, fit
 from fusion_gym.recordings.fitting import deviations
-from fusion_gym.systems.tobit.recorded import WindowNoise
+from fusion_gym.systems.tobit.recorded import ResampledNoise, WindowNoise
 from fusion_gym.validation import ConfigurationError
 
 ENV = "fusion_gym/RecordedFusion-v1"
@@ -30,6 +31,7 @@ def write(folder: Path, change: Callable[[np.ndarray], Any] = lambda path: None)
         path[row] = [[0.9, 0.05], [0.0, 0.8]] @ path[row - 1] + draw[row]
     path += 50.0 + 10.0 * np.sin(2.0 * np.pi * np.arange(ROWS) / 96)[:, None]
     change(path)
+    folder.mkdir(exist_ok=True)
     index = pd.date_range("2026-01-01 05:00", periods=ROWS, freq="15min", name="time")
     pd.DataFrame(path, index=index, columns=["a [K]", "b [K]"]).to_csv(folder / "log.csv")
     return str(folder / "log.csv")
@@ -222,6 +224,32 @@ def test_resampled_noise_has_the_residuals_of_the_fitted_part(tmp_path: Path) ->
         assert batch.task.noise is None or batch.task.system.offers("available")
     assert errors["resampled"] == pytest.approx(0.1, abs=0.06)
     assert abs(errors["normal"] - 0.1) > abs(errors["resampled"] - 0.1)
+
+
+def test_windows_of_few_readings_are_left_out(tmp_path: Path) -> None:
+    """A gap covers one window of the held-out part whole and three quarters of the next."""
+    steps, first = HORIZON + 1, ROWS // 2 + 3 * (HORIZON + 1)
+
+    def gap(path: np.ndarray) -> None:
+        path[first : first + steps + 3 * steps // 4] = np.nan
+
+    whole, part = (
+        make(write(tmp_path / name, change)).noise
+        for name, change in (("whole", lambda path: None), ("part", gap))
+    )
+    assert isinstance(whole, WindowNoise)
+    assert isinstance(part, WindowNoise)
+    assert part.first.tolist() == np.delete(whole.first, [3, 4]).tolist()
+
+
+def test_resampled_noises_are_rows_of_residuals() -> None:
+    """All of them, whole, as often as each other; later channels are the usual normals."""
+    residuals = 10.0 + np.arange(12.0).reshape(4, 3)
+    drawn = ResampledNoise(residuals).steps(0, 0, 0, 2000, 5)
+    rows, counts = np.unique(drawn[:, :3], axis=0, return_counts=True)
+    assert np.array_equal(rows, residuals)
+    assert counts == pytest.approx(500, abs=80)
+    assert np.array_equal(drawn[:, 3:], PhiloxNoise().steps(0, 0, 0, 2000, 5)[:, 3:])
 
 
 def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
