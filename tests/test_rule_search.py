@@ -10,11 +10,13 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.task import Task
+from fusion_gym.evaluation import rule_search
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.policy_batch import run_policies, run_priced
+from fusion_gym.evaluation.policy_batch import EpisodeMeans, run_policies, run_priced
 from fusion_gym.evaluation.rule_search import (
     Generation,
     RuleSearch,
+    ThresholdTrial,
     run_generations,
     search_of_class,
     search_result,
@@ -92,6 +94,59 @@ def test_a_resumed_search_is_the_uninterrupted_one() -> None:
         list(run_generations(small(seed=7), earlier))
     with pytest.raises(ConfigurationError, match="generations = "):
         search_result(small(), [])
+
+
+@pytest.fixture
+def seeds(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
+    """The seeds of every batch of a search, whose episodes are not run."""
+    batches: list[set[int]] = []
+
+    def means(seeds: Any) -> EpisodeMeans:
+        batches.append(set(np.asarray(seeds).tolist()))
+        return EpisodeMeans(*np.ones((4, len(seeds))))
+
+    def policies(task: Task, rules: Any, episodes: int, seed: int) -> list[EpisodeMeans]:
+        return [means(seed + np.arange(episodes))] * len(rules)
+
+    monkeypatch.setattr(rule_search, "run_policies", policies)
+    monkeypatch.setattr(rule_search, "run_priced", lambda task, policy, seeds, prices: means(seeds))
+    return batches
+
+
+def test_a_search_runs_no_episode_twice(seeds: list[set[int]]) -> None:
+    """Of the start, of each generation and of the end, which measures both rules on the same."""
+    search_rule(small())
+    phases = [batch for place, batch in enumerate(seeds) if batch not in seeds[:place]]
+    assert [len(batch) for batch in phases] == [16, 4, 5, 6, 8, 32]
+    assert len(set().union(*phases)) == sum(map(len, phases))
+    assert phases[-1] == seeds[-len(PRICES) - 1]
+
+
+@pytest.mark.usefixtures("seeds")
+def test_the_result_is_the_mean_of_the_second_half() -> None:
+    search, zero = small(), np.zeros(len(small().coordinates))
+    means = [zero + value for value in (9.0, 7.0, 0.2, 0.4)]
+    halves = [Generation(place, (), mean.tolist()) for place, mean in enumerate(means)]
+    single = Generation(0, (), (zero + 0.3).tolist())
+    assert search_result(search, halves).policy == search_result(search, [single]).policy
+
+
+def test_a_cost_without_number_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A candidate whose error is NaN or infinite in one of its episodes stays comparable."""
+    search = small()
+    search.__dict__["start"] = (ThresholdTrial("", 1.0, 0.0, 1.0),) * len(PRICES)
+
+    def run(task: Task, policy: Any, seeds: Any, prices: Any) -> EpisodeMeans:
+        error = np.ones(len(seeds))
+        error[policy.numbers.margin[0] > 5.0] = np.nan
+        error[policy.numbers.margin[0] < 0.5] = np.inf
+        return EpisodeMeans(error, error, error, np.zeros(len(seeds)))
+
+    monkeypatch.setattr(rule_search, "run_priced", run)
+    points = np.zeros((3, len(search.coordinates)))
+    points[:, search.coordinates.index("margin")] = 0.0, 2.0, -2.0
+    costs = rule_search._objectives(search, points, 4, 0)
+    assert costs == pytest.approx([1.0, 1e30, 1e30])
 
 
 def test_trials_are_what_each_policy_does_alone() -> None:
