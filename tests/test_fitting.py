@@ -78,8 +78,8 @@ def test_likelihood_is_least_squares_without_gaps(monkeypatch: pytest.MonkeyPatc
 
 
 def test_an_honest_plant_has_nees_of_one_and_no_warning() -> None:
-    values, rows = deviations(recording(simulate(120_000)), 0.5)
-    plant = fit(recording(simulate(120_000)), exact=True)
+    own = recording(simulate(40_000))
+    plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
     criticism = criticise(plant, values[rows:])
     assert [row.rate for row in criticism] == list(RATES)
     assert all(0.95 <= row.nees <= 1.05 for row in criticism), criticism

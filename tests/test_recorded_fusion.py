@@ -195,6 +195,19 @@ def test_seed_and_episode_determine_the_window(tmp_path: Path) -> None:
         run_episodes(task, policy, 100, 7)
 
 
+def test_prices_and_other_channels_are_drawn_as_without_a_recording(tmp_path: Path) -> None:
+    price: dict[str, Any] = {"cost_weight": "random", "price_range": (0.01, 1.0)}
+    task = make(write(tmp_path), **price)
+    usual = fusion_gym.make_task("fusion_gym/LinearFusion-v2", **price)
+    prices = [EpisodeBatch.seeded(item, 5, 3).price for item in (task, usual)]
+    assert np.array_equal(*prices)
+    assert isinstance(task.noise, WindowNoise)
+    count = task.noise.rows.shape[1]
+    more = task.noise.steps(4, 1, 2, 6, count + 2)
+    assert np.array_equal(more[:, :count], task.noise.steps(4, 1, 2, 6, count))
+    assert np.array_equal(more[:, count:], PhiloxNoise().steps(4, 1, 2, 6, count + 2)[:, count:])
+
+
 def test_every_interface_replays_the_window(tmp_path: Path) -> None:
     log = write(tmp_path)
     options = fit(Recording.read(log).select(), exact=True).options
@@ -268,7 +281,9 @@ def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
     for options, message in cases:
         with pytest.raises(ConfigurationError, match=message):
             fusion_gym.make_task(ENV, log=log, **{"tokens": "unlimited"} | plant | options)
-    with pytest.raises(ConfigurationError, match="source = 'resampled' is not allowed"):
+    with pytest.raises(
+        ConfigurationError, match=r"source = 'resampled' is not allowed: .* and 100 must"
+    ):
         fusion_gym.make_task(ENV, source="resampled")
     with pytest.raises(ConfigurationError, match=r"transition = .* left out without a log"):
         fusion_gym.make_task(ENV, transition=[[0.5]])

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fusion_gym.recordings import ChannelCard, Recording
+from fusion_gym.recordings import ChannelCard, RecordedChannel, Recording
 from fusion_gym.validation import ConfigurationError
 from tests.command_runs import refusal, succeed
 
@@ -146,6 +146,23 @@ def test_the_card_says_what_a_channel_does(name: str, tmp_path: Path) -> None:
     recording = read(table, tmp_path)
     assert is_said(card(recording, "a")), card(recording, "a")
     assert not card(recording, "b").fault
+
+
+@pytest.mark.parametrize(("rows", "ties"), [(6000, 60), (200, 20)])
+@pytest.mark.parametrize("end", ["low", "high"])
+def test_a_limit_is_an_extreme_that_a_percent_of_the_readings_have(
+    rows: int, ties: int, end: str
+) -> None:
+    """At least 20; of the values of a coarse channel, each of which is frequent, none is one."""
+    sign = 1.0 if end == "high" else -1.0
+    values = np.random.default_rng(0).random((rows, 3))
+    values[: ties - 1, 0] = values[:ties, 1] = 1.0
+    values[:, 2] = np.floor(11.0 * values[:, 2])
+    index = pd.date_range("2026-01-01", periods=rows, freq="1min")
+    table = pd.DataFrame(sign * values, index=index, columns=list("abc"))
+    cards = Recording(table, tuple(map(RecordedChannel, "abc"))).card
+    assert [getattr(row.channel, end) for row in cards] == [sign * np.inf, sign, sign * np.inf]
+    assert cards[1].saturated == pytest.approx(ties / rows)
 
 
 @pytest.mark.parametrize("noise", [0.05, 3.0])

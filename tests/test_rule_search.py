@@ -132,9 +132,10 @@ def test_the_result_is_the_mean_of_the_second_half() -> None:
 
 
 def test_a_cost_without_number_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A candidate whose error is NaN or infinite in one of its episodes stays comparable."""
+    """NaN or infinite; other objectives are the mean ratio to the single thresholds."""
     search = small()
-    search.__dict__["start"] = (ThresholdTrial("", 1.0, 0.0, 1.0),) * len(PRICES)
+    singles = [ThresholdTrial("", 1.0, 10.0, error) for error in (0.9, 1.0, 0.0)]
+    search.__dict__["start"] = tuple(singles)  # at the prices .01, .1, 1 they cost 1, 2, 10
 
     def run(task: Task, policy: Any, seeds: Any, prices: Any) -> EpisodeMeans:
         error = np.ones(len(seeds))
@@ -146,7 +147,8 @@ def test_a_cost_without_number_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> 
     points = np.zeros((3, len(search.coordinates)))
     points[:, search.coordinates.index("margin")] = 0.0, 2.0, -2.0
     costs = rule_search._objectives(search, points, 4, 0)
-    assert costs == pytest.approx([1.0, 1e30, 1e30])
+    assert costs[0] == pytest.approx((1.0 + 0.5 + 0.1) / 3.0)
+    assert np.all((np.array(costs[1:]) > 1e29) & np.isfinite(costs[1:]))
 
 
 def test_trials_are_what_each_policy_does_alone() -> None:
@@ -221,7 +223,7 @@ def test_other_scores_are_searched_too(options: dict[str, Any], score: Any) -> N
     ("changes", "message"),
     [
         ({"prices": ()}, "prices = "),
-        ({"prices": (0.1, 0.1)}, "prices = "),
+        ({"prices": (0.1, 0.1)}, r"prices = .* it must be one or more different numbers$"),
         ({"prices": (0.1, -1.0)}, "prices = "),
         ({"generations": 0}, "generations = 0"),
         ({"population": 2}, "population = 2"),
