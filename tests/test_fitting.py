@@ -67,14 +67,14 @@ def test_likelihood_finds_the_plant_despite_gaps_and_two_rates() -> None:
 
 
 def test_likelihood_is_least_squares_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = recording(simulate(2000))
-    squares = fit(own, exact=True)
+    """Up to the degrees of freedom: 299 steps and three coefficients a channel."""
+    own = recording(simulate(600))
+    squares = fit(own, exact=True, order=1)
     monkeypatch.setattr("fusion_gym.recordings.fitting._is_complete", lambda values: False)
-    likelihood = fit(own, exact=True)
-    assert likelihood.transition == pytest.approx(squares.transition, abs=0.002)
-    assert likelihood.process_covariance == pytest.approx(
-        squares.process_covariance, rel=0.01, abs=0.005
-    )
+    likelihood = fit(own, exact=True, order=1)
+    assert likelihood.transition == pytest.approx(squares.transition, abs=1e-7)
+    expected = squares.process_covariance * (299 - 3) / 299
+    assert likelihood.process_covariance == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_an_honest_plant_has_nees_of_one_and_no_warning() -> None:

@@ -289,6 +289,11 @@ def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
         fusion_gym.make_task(ENV, transition=[[0.5]])
 
 
+def test_other_weights_of_the_made_up_log_may_be_given() -> None:
+    task = fusion_gym.make_task(ENV, state_weights=[1.0, 2.0, 3.0], reward_scale=2.0)
+    assert task.reward.state_weights[:, 0].tolist() == [2.0, 4.0, 6.0]
+
+
 def test_the_packaged_plant_is_fitted_to_the_packaged_log() -> None:
     plant = fit(Recording.read("tanks").select(), exact=True)
     task = fusion_gym.make_task(ENV)
