@@ -77,6 +77,21 @@ def test_likelihood_is_least_squares_without_gaps(monkeypatch: pytest.MonkeyPatc
     assert likelihood.process_covariance == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
+def test_criticism_of_white_noise_has_a_closed_form() -> None:
+    """What is not sent has its whole error; two sensors take turns, each in every fourth step."""
+    variance, step = np.array([4.0, 9.0]), np.arange(200)
+    values = np.random.default_rng(0).normal(size=(200, 2)) * np.sqrt(variance)
+    values[7, 1] = np.nan
+    plant = FittedPlant(("a", "b"), np.zeros((2, 2)), np.diag(variance), np.full(2, 1e-9), 1)
+    silent = np.stack([step % 4 != 0, step % 4 != 2], axis=1)
+    squares = values**2 / variance
+    always, fourth = criticise(plant, values, (1.0, 0.25))
+    assert (always.real, always.model, always.nees) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert fourth.real == pytest.approx(np.nansum(squares * silent) / 399)
+    assert fourth.model == pytest.approx(299 / 399)
+    assert fourth.nees == pytest.approx(np.nansum(squares * silent) / 299)
+
+
 def test_an_honest_plant_has_nees_of_one_and_no_warning() -> None:
     own = recording(simulate(40_000))
     plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
@@ -148,6 +163,18 @@ def test_residuals_of_too_few_lags_are_not_white() -> None:
     assert any("not white" in line for line in warnings_of(plant, values[rows:], []))
     white = recording(simulate(20_000)).values.to_numpy()
     assert max(value for _, _, value in residual_correlations(plant, white)) < 0.05
+
+
+def test_residuals_are_those_of_readings_only() -> None:
+    """Steps without a reading change no correlation of a plant without memory."""
+    plant = FittedPlant(("a", "b"), np.zeros((2, 2)), np.eye(2), np.full(2, 1e-9), 1)
+    values = np.random.default_rng(0).normal(size=(100, 2)).cumsum(0)
+    gaps = np.full((200, 2), np.nan)
+    gaps[::2] = values
+    both = (residual_correlations(plant, path) for path in (values, gaps))
+    for (name, lag, value), row in zip(*both, strict=True):
+        assert row == (name, lag, pytest.approx(value))
+        assert value > 0.8
 
 
 def test_a_daily_cycle_is_removed() -> None:

@@ -186,6 +186,10 @@ def test_the_start_fits_the_margin_to_the_prices() -> None:
     point = dict(zip(search.coordinates, search.first_point(), strict=True))
     assert point["margin_exponent"] == pytest.approx(np.log(20.0) / np.log(100.0))
     assert point["margin"] == pytest.approx(2.0 / 3.0 * np.log(20.0))
+    two = dataclasses.replace(search, prices=PRICES[::2])
+    two.__dict__["start"] = trials[:2]
+    assert two.coordinates == search.coordinates
+    assert two.first_point()[-1] == pytest.approx(np.log(20.0) / np.log(100.0))
     rule: Any = make_policy("priced_threshold:margin=4,margin_exponent=1,price=0.1", task_of())
     same: Any = make_policy("priced_threshold:margin=1,price=0.1", task_of())  # 4 · 0.1 is below 1
     results = [run_policies(task_of(), [policy], 4, 0)[0] for policy in (rule, same)]
