@@ -160,7 +160,9 @@ def test_trials_are_what_each_policy_does_alone() -> None:
         single = run_episodes(task, make_policy(trial.policy, task), 8, 3)
         cost = float((single.error_cost + 0.1 * single.tokens).mean())
         assert trial.cost(0.1) == pytest.approx(cost)
-    with pytest.raises(ConfigurationError, match="template = 'always'"):
+    with pytest.raises(
+        ConfigurationError, match=r"template = 'always' .*: it must be a policy with"
+    ):
         try_thresholds(task, "always", values, 2, 0)
 
 
