@@ -4,29 +4,27 @@ import os
 from collections.abc import Iterator
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
 import pytest
-import torch
 
-from fusion_gym.envs.registration import ENVIRONMENTS
-from fusion_gym.policies import registry
-from fusion_gym.policies.schedule_file import Schedule
-
-# Two test processes share two cores: more threads would only wait for each other.
-torch.set_num_threads(1)
-os.environ["OMP_NUM_THREADS"] = "1"  # of the commands that tests start
+# Two test processes share two cores: more threads would only wait for each other. NumPy and torch
+# read this when they are imported, which is later, and so do the commands that tests start.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 
 @pytest.fixture
 def own_table(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test registers as a policy is gone after it."""
+    from fusion_gym.policies import registry
+
     monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))
 
 
 @pytest.fixture
 def unsearched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make policies without the search for their schedule, which takes minutes."""
+    import numpy as np
+
+    from fusion_gym.policies.schedule_file import Schedule
 
     def optimum(system: Any, packets: int, period: int, *_: Any) -> Schedule:
         return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
@@ -37,6 +35,11 @@ def unsearched(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def registries() -> Iterator[None]:
     """What a test registers, environments too, is gone after it."""
+    import gymnasium as gym
+
+    from fusion_gym.envs.registration import ENVIRONMENTS
+    from fusion_gym.policies import registry
+
     tables: tuple[dict[str, Any], ...] = (ENVIRONMENTS, gym.registry, registry._ROWS)
     stored = [(table, dict(table)) for table in tables]
     yield

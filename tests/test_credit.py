@@ -8,7 +8,11 @@ import torch
 
 import fusion_gym
 from fusion_gym.envs.privileged import PrivilegedVecEnv
-from fusion_gym.training.counterfactual import CounterfactualPPO, RolloutBatch
+from fusion_gym.training.counterfactual import (
+    CounterfactualMaskablePPO,
+    CounterfactualPPO,
+    RolloutBatch,
+)
 
 ENV = "fusion_gym/TobitOscillator-v1"
 
@@ -17,16 +21,18 @@ def env_of(runs: int = 5, local: bool = False, **options: Any) -> PrivilegedVecE
     return PrivilegedVecEnv(fusion_gym.make_task(ENV, filter="tobit", **options), runs, local=local)
 
 
+@pytest.mark.parametrize("path_credit", [True, False])
 @pytest.mark.parametrize("kind", ["all", "flips", "local"])
-def test_the_surrogate_is_clipped_from_below(kind: Any) -> None:
+def test_the_surrogate_is_clipped_from_below(kind: Any, path_credit: bool) -> None:
     """min(ρ A, clip(ρ) A) (Schulman et al. 2017), of alternatives and of what came later.
 
     What came later is weighed with the whole action's ratio, the product of its factors', or
-    where sensors decide by themselves with each sensor's own.
+    where sensors decide by themselves with each sensor's own. Without ``path_credit`` it does not
+    count.
     """
     env = env_of(local=kind == "local")
     model = CounterfactualPPO(
-        *("MlpPolicy", env), ent_coef=0.0, vf_coef=0.0, batch_size=30,
+        *("MlpPolicy", env), ent_coef=0.0, vf_coef=0.0, batch_size=30, path_credit=path_credit,
         alternatives=None if kind == "local" else kind,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(3)
@@ -50,7 +56,26 @@ def test_the_surrogate_is_clipped_from_below(kind: Any) -> None:
     gain = (old.exp().numpy() * clipped(ratio, advantages.numpy())).sum((-1, -2))
     change = taken[..., 0] if kind == "local" else taken.sum((-1, -2))[:, None]
     late = clipped(change.exp().numpy(), surplus.numpy()[:, None]).sum(-1)
-    np.testing.assert_allclose(float(loss.detach()), -(gain + late).mean(), rtol=1e-4)
+    np.testing.assert_allclose(float(loss.detach()), -(gain + path_credit * late).mean(), rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["all", "flips"])
+def test_masked_requests_have_no_probability(kind: Any) -> None:
+    """Those of single sensors; the other sensors decide as without masks."""
+    model = CounterfactualMaskablePPO("MlpPolicy", env_of(), alternatives=kind, batch_size=30)
+    observations = torch.rand((6, *model.observation_space.shape))  # type: ignore[misc]
+    masks = torch.ones((6, 6), dtype=torch.bool)
+    masks[::2, 3] = False  # the request of the second of three sensors
+
+    def requests(masks: torch.Tensor) -> torch.Tensor:
+        values = model._decisions.log_probabilities(model._logits(observations, masks)).exp()
+        return values @ model._decisions.bits if kind == "all" else values[..., 1][:, None]
+
+    apart, usual = requests(masks)[:, 0].detach(), requests(torch.ones_like(masks))[:, 0].detach()
+    assert (apart[::2, 1] < 1e-6).all()
+    assert (usual > 0.1).all()
+    apart[::2, 1] = usual[::2, 1]
+    torch.testing.assert_close(apart, usual)
 
 
 def test_an_episode_cut_short_is_worth_what_its_last_observation_is() -> None:

@@ -2,6 +2,8 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ from fusion_gym.evaluation.field_study import (
     FieldStudy,
     MethodPoint,
     compare_with_practice,
+    point_of,
 )
+from fusion_gym.systems.tobit.recorded import WindowNoise
 from tests.command_runs import refusal, succeed
 
 STUDY = FieldStudy({}, rate=0.05, shape=(1.0, 1.0), horizon=50, source="normal")
@@ -44,6 +48,44 @@ def test_methods_are_compared_at_equal_packets_and_at_equal_error() -> None:
     assert results["centralised"].relative.low < -0.25 < results["centralised"].relative.high
     assert results[PRACTICE].packets == pytest.approx(1.0)
     assert results[PRACTICE].ratio == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_the_interval_is_that_of_blocks_of_five_windows(level: float) -> None:
+    """Errors that cancel within a block have none; errors of whole blocks have that of 16."""
+    turns = np.tile([2.0, -1.0, -1.0, 1.0, -1.0], 16)
+    blocks = np.repeat(np.resize([1.0, -1.0], 16), 5)
+    errors = (1.0 + 0.1 * (level * blocks + (1.0 - level) * turns)).tolist()
+    rates = [[0.05, 0.05]] * 80
+    points = {
+        PRACTICE: [MethodPoint([1.0], 1.0, [1.0] * 80, rates, [1.0, 1.0])],
+        "centralised": [MethodPoint([1.0], 1.0, errors, rates, [1.0, 1.0])],
+    }
+    points = {name: own * 2 for name, own in points.items()}
+    relative = compare_with_practice(STUDY, points)[1].relative
+    expected = level * 1.96 * 0.1 / np.sqrt(16)
+    assert relative.mean == pytest.approx(0.0, abs=1e-12)
+    assert relative.high - relative.mean == pytest.approx(expected, rel=0.1, abs=1e-12)
+    assert relative.mean - relative.low == pytest.approx(expected, rel=0.1, abs=1e-12)
+
+
+def test_errors_are_means_of_the_steps_with_readings() -> None:
+    """Half the readings of the second sensor are absent, and their errors count as zero."""
+    known = np.zeros((8, 2))
+    known[::2, 1] = np.nan
+    rows = np.hstack([np.zeros((8, 2)), known])
+    noise = WindowNoise(np.zeros((2, 7)), rows, np.array([0, 4]), 2)
+    study: Any = SimpleNamespace(
+        task=lambda *names: SimpleNamespace(noise=noise),
+        shape=(1.0, 1.0), options={"state_weights": [0.5, 0.125, 0.0]},
+    )  # fmt: skip
+    squared = np.array([[1.0, 2.0, 7.0], [3.0, 6.0, 7.0]])  # of two windows
+    cost = squared @ study.options["state_weights"]
+    real: Any = SimpleNamespace(squared_error=squared, error_cost=cost, rate=np.zeros((2, 2)))
+    result = point_of(study, [1.0], SimpleNamespace(error_cost=np.ones(3)), real)  # type: ignore[arg-type]
+    assert result.deviations == pytest.approx(np.sqrt([2.0, 4.0 / 0.5]))
+    assert np.mean(result.errors) == pytest.approx(0.5 * 2.0 + 0.125 * 4.0 / 0.5)
+    assert result.errors[1] == pytest.approx(3.0 * result.errors[0])
 
 
 def test_a_study_ends_in_the_settings_of_devices(

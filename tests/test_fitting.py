@@ -67,19 +67,34 @@ def test_likelihood_finds_the_plant_despite_gaps_and_two_rates() -> None:
 
 
 def test_likelihood_is_least_squares_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = recording(simulate(2000))
-    squares = fit(own, exact=True)
+    """Up to the degrees of freedom: 299 steps and three coefficients a channel."""
+    own = recording(simulate(600))
+    squares = fit(own, exact=True, order=1)
     monkeypatch.setattr("fusion_gym.recordings.fitting._is_complete", lambda values: False)
-    likelihood = fit(own, exact=True)
-    assert likelihood.transition == pytest.approx(squares.transition, abs=0.002)
-    assert likelihood.process_covariance == pytest.approx(
-        squares.process_covariance, rel=0.01, abs=0.005
-    )
+    likelihood = fit(own, exact=True, order=1)
+    assert likelihood.transition == pytest.approx(squares.transition, abs=1e-7)
+    expected = squares.process_covariance * (299 - 3) / 299
+    assert likelihood.process_covariance == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_criticism_of_white_noise_has_a_closed_form() -> None:
+    """What is not sent has its whole error; two sensors take turns, each in every fourth step."""
+    variance, step = np.array([4.0, 9.0]), np.arange(200)
+    values = np.random.default_rng(0).normal(size=(200, 2)) * np.sqrt(variance)
+    values[7, 1] = np.nan
+    plant = FittedPlant(("a", "b"), np.zeros((2, 2)), np.diag(variance), np.full(2, 1e-9), 1)
+    silent = np.stack([step % 4 != 0, step % 4 != 2], axis=1)
+    squares = values**2 / variance
+    always, fourth = criticise(plant, values, (1.0, 0.25))
+    assert (always.real, always.model, always.nees) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert fourth.real == pytest.approx(np.nansum(squares * silent) / 399)
+    assert fourth.model == pytest.approx(299 / 399)
+    assert fourth.nees == pytest.approx(np.nansum(squares * silent) / 299)
 
 
 def test_an_honest_plant_has_nees_of_one_and_no_warning() -> None:
-    values, rows = deviations(recording(simulate(120_000)), 0.5)
-    plant = fit(recording(simulate(120_000)), exact=True)
+    own = recording(simulate(40_000))
+    plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
     criticism = criticise(plant, values[rows:])
     assert [row.rate for row in criticism] == list(RATES)
     assert all(0.95 <= row.nees <= 1.05 for row in criticism), criticism
@@ -107,6 +122,39 @@ def test_a_second_lag_is_fitted_where_it_helps() -> None:
     assert not task.reward.state_weights[3:].any()
 
 
+def test_the_order_is_chosen_on_rows_that_were_not_fitted() -> None:
+    """The second lag ends with the fitted two thirds, and is of no use after them."""
+    draw, path = np.random.default_rng(0).normal(size=2400), np.zeros((2400, 1))
+    for row in range(2, 2400):
+        lags = (1.2, -0.6) if row < 800 else (0.75, 0.0)
+        path[row] = lags @ path[[row - 1, row - 2]] + draw[row]
+    assert fit(recording(path), exact=True).order == 1
+
+
+def test_an_explosive_fit_is_damped_and_has_the_residuals_of_its_regression() -> None:
+    """Least squares by definition: W with n - k degrees of freedom, all poles times one factor."""
+    path = 1.02 ** np.arange(800)[:, None] + np.random.default_rng(0).normal(size=(800, 1))
+    plant = fit(recording(path), exact=True, order=2)
+    values = deviations(recording(path), 0.5)[0][:400, 0]
+    lags = np.stack([values[1:-1], values[:-2]], axis=1)
+    coefficients, squares, *_ = np.linalg.lstsq(lags, values[2:])
+    assert plant.process_covariance[0, 0] == pytest.approx(float(squares[0]) / (398 - 2), rel=1e-9)
+    poles = np.sort_complex(np.roots([1.0, *-coefficients]))
+    assert np.abs(poles).max() > 1.001
+    damped = np.sort_complex(np.linalg.eigvals(plant.transition))
+    assert damped == pytest.approx(poles * 0.9999 / np.abs(poles).max(), rel=1e-9)
+
+
+def test_changes_and_weights_have_a_closed_form() -> None:
+    """Two channels x' = a x + w: a change in ten steps has variance 2 P (1 - a^10)."""
+    a, variance = np.array([0.9, 0.5]), np.array([4.0, 9.0])
+    plant = FittedPlant(
+        ("a", "b"), np.diag(a), np.diag(variance * (1.0 - a**2)), np.full(2, 1e-6), 1
+    )
+    assert plant.typical_changes == pytest.approx(np.sqrt(2.0 * variance * (1.0 - a**10)))
+    assert plant.options["state_weights"] == pytest.approx(1.0 / variance / 2.0)
+
+
 def test_residuals_of_too_few_lags_are_not_white() -> None:
     own = recording(simulate(20_000, second=-0.5 * np.eye(3)))
     values, rows = deviations(own, 0.5)
@@ -115,6 +163,18 @@ def test_residuals_of_too_few_lags_are_not_white() -> None:
     assert any("not white" in line for line in warnings_of(plant, values[rows:], []))
     white = recording(simulate(20_000)).values.to_numpy()
     assert max(value for _, _, value in residual_correlations(plant, white)) < 0.05
+
+
+def test_residuals_are_those_of_readings_only() -> None:
+    """Steps without a reading change no correlation of a plant without memory."""
+    plant = FittedPlant(("a", "b"), np.zeros((2, 2)), np.eye(2), np.full(2, 1e-9), 1)
+    values = np.random.default_rng(0).normal(size=(100, 2)).cumsum(0)
+    gaps = np.full((200, 2), np.nan)
+    gaps[::2] = values
+    both = (residual_correlations(plant, path) for path in (values, gaps))
+    for (name, lag, value), row in zip(*both, strict=True):
+        assert row == (name, lag, pytest.approx(value))
+        assert value > 0.8
 
 
 def test_a_daily_cycle_is_removed() -> None:

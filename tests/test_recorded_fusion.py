@@ -11,11 +11,12 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.recordings import Recording, fit
 from fusion_gym.recordings.fitting import deviations
-from fusion_gym.systems.tobit.recorded import WindowNoise
+from fusion_gym.systems.tobit.recorded import ResampledNoise, WindowNoise
 from fusion_gym.validation import ConfigurationError
 
 ENV = "fusion_gym/RecordedFusion-v1"
@@ -30,6 +31,7 @@ def write(folder: Path, change: Callable[[np.ndarray], Any] = lambda path: None)
         path[row] = [[0.9, 0.05], [0.0, 0.8]] @ path[row - 1] + draw[row]
     path += 50.0 + 10.0 * np.sin(2.0 * np.pi * np.arange(ROWS) / 96)[:, None]
     change(path)
+    folder.mkdir(exist_ok=True)
     index = pd.date_range("2026-01-01 05:00", periods=ROWS, freq="15min", name="time")
     pd.DataFrame(path, index=index, columns=["a [K]", "b [K]"]).to_csv(folder / "log.csv")
     return str(folder / "log.csv")
@@ -193,6 +195,19 @@ def test_seed_and_episode_determine_the_window(tmp_path: Path) -> None:
         run_episodes(task, policy, 100, 7)
 
 
+def test_prices_and_other_channels_are_drawn_as_without_a_recording(tmp_path: Path) -> None:
+    price: dict[str, Any] = {"cost_weight": "random", "price_range": (0.01, 1.0)}
+    task = make(write(tmp_path), **price)
+    usual = fusion_gym.make_task("fusion_gym/LinearFusion-v2", **price)
+    prices = [EpisodeBatch.seeded(item, 5, 3).price for item in (task, usual)]
+    assert np.array_equal(*prices)
+    assert isinstance(task.noise, WindowNoise)
+    count = task.noise.rows.shape[1]
+    more = task.noise.steps(4, 1, 2, 6, count + 2)
+    assert np.array_equal(more[:, :count], task.noise.steps(4, 1, 2, 6, count))
+    assert np.array_equal(more[:, count:], PhiloxNoise().steps(4, 1, 2, 6, count + 2)[:, count:])
+
+
 def test_every_interface_replays_the_window(tmp_path: Path) -> None:
     log = write(tmp_path)
     options = fit(Recording.read(log).select(), exact=True).options
@@ -224,6 +239,32 @@ def test_resampled_noise_has_the_residuals_of_the_fitted_part(tmp_path: Path) ->
     assert abs(errors["normal"] - 0.1) > abs(errors["resampled"] - 0.1)
 
 
+def test_windows_of_few_readings_are_left_out(tmp_path: Path) -> None:
+    """A gap covers one window of the held-out part whole and three quarters of the next."""
+    steps, first = HORIZON + 1, ROWS // 2 + 3 * (HORIZON + 1)
+
+    def gap(path: np.ndarray) -> None:
+        path[first : first + steps + 3 * steps // 4] = np.nan
+
+    whole, part = (
+        make(write(tmp_path / name, change)).noise
+        for name, change in (("whole", lambda path: None), ("part", gap))
+    )
+    assert isinstance(whole, WindowNoise)
+    assert isinstance(part, WindowNoise)
+    assert part.first.tolist() == np.delete(whole.first, [3, 4]).tolist()
+
+
+def test_resampled_noises_are_rows_of_residuals() -> None:
+    """All of them, whole, as often as each other; later channels are the usual normals."""
+    residuals = 10.0 + np.arange(12.0).reshape(4, 3)
+    drawn = ResampledNoise(residuals).steps(0, 0, 0, 2000, 5)
+    rows, counts = np.unique(drawn[:, :3], axis=0, return_counts=True)
+    assert np.array_equal(rows, residuals)
+    assert counts == pytest.approx(500, abs=80)
+    assert np.array_equal(drawn[:, 3:], PhiloxNoise().steps(0, 0, 0, 2000, 5)[:, 3:])
+
+
 def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
     log = write(tmp_path)
     plant = fit(Recording.read(log).select(), exact=True).options
@@ -240,10 +281,17 @@ def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
     for options, message in cases:
         with pytest.raises(ConfigurationError, match=message):
             fusion_gym.make_task(ENV, log=log, **{"tokens": "unlimited"} | plant | options)
-    with pytest.raises(ConfigurationError, match="source = 'resampled' is not allowed"):
+    with pytest.raises(
+        ConfigurationError, match=r"source = 'resampled' is not allowed: .* and 100 must"
+    ):
         fusion_gym.make_task(ENV, source="resampled")
     with pytest.raises(ConfigurationError, match=r"transition = .* left out without a log"):
         fusion_gym.make_task(ENV, transition=[[0.5]])
+
+
+def test_other_weights_of_the_made_up_log_may_be_given() -> None:
+    task = fusion_gym.make_task(ENV, state_weights=[1.0, 2.0, 3.0], reward_scale=2.0)
+    assert task.reward.state_weights[:, 0].tolist() == [2.0, 4.0, 6.0]
 
 
 def test_the_packaged_plant_is_fitted_to_the_packaged_log() -> None:

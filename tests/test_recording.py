@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fusion_gym.recordings import ChannelCard, Recording
+from fusion_gym.recordings import ChannelCard, RecordedChannel, Recording
 from fusion_gym.validation import ConfigurationError
 from tests.command_runs import refusal, succeed
 
@@ -148,6 +148,43 @@ def test_the_card_says_what_a_channel_does(name: str, tmp_path: Path) -> None:
     assert not card(recording, "b").fault
 
 
+@pytest.mark.parametrize(("rows", "ties"), [(6000, 60), (200, 20)])
+@pytest.mark.parametrize("end", ["low", "high"])
+def test_a_limit_is_an_extreme_that_a_percent_of_the_readings_have(
+    rows: int, ties: int, end: str
+) -> None:
+    """At least 20, of ten values or more, unless each value is as frequent."""
+    sign, row = 1.0 if end == "high" else -1.0, np.arange(rows)
+    values = np.random.default_rng(0).random((rows, 5))
+    values[: ties - 1, 0] = values[:ties, 1] = 1.0
+    values[:, 2] = np.floor(11.0 * values[:, 2])
+    for place, others in ((3, 8), (4, 9)):
+        values[:, place] = np.where(row % 10 > 0, 1.0, row // 10 % others / 10)
+    index = pd.date_range("2026-01-01", periods=rows, freq="1min")
+    table = pd.DataFrame(sign * values, index=index, columns=list("abcde"))
+    cards = Recording(table, tuple(map(RecordedChannel, "abcde"))).card
+    limits = [getattr(card.channel, end) * sign for card in cards]
+    assert limits == [np.inf, 1.0, np.inf, np.inf, 1.0]
+    assert cards[1].saturated == pytest.approx(ties / rows)
+
+
+def test_the_figures_of_a_card_are_those_of_its_readings() -> None:
+    values = 20.0 + 3.0 * np.random.default_rng(0).normal(size=900)
+    values[::3] = np.nan
+    index = pd.date_range("2026-01-01", periods=900, freq="1min")
+    table = pd.DataFrame({"a": values, "b": 1.0}, index=index)
+    channels = RecordedChannel("a", "K"), RecordedChannel("b", "K")
+    (figures, constant), present = Recording(table, channels).card, values[np.isfinite(values)]
+    assert (figures.readings, figures.channel.unit, figures.every) == (600, "K", 1.0)
+    assert figures.missing == pytest.approx(1.0 / 3.0)
+    assert figures.mean == pytest.approx(present.mean())
+    assert figures.deviation == pytest.approx(present.std())
+    assert figures.resolution == pytest.approx(np.diff(np.sort(present)).min())
+    assert np.isnan(figures.agreement)
+    assert (figures.saturated, figures.stuck, figures.spikes) == (0.0, 0.0, 0)
+    assert (constant.resolution, constant.saturated, constant.missing) == (0.0, 0.0, 0.0)
+
+
 @pytest.mark.parametrize("noise", [0.05, 3.0])
 def test_a_channel_that_disagrees_with_agreeing_peers_is_faulty(
     noise: float, tmp_path: Path
@@ -183,6 +220,15 @@ def test_seconds_are_times(tmp_path: Path) -> None:
     recording = read(log(time=np.arange(60) * 30 + 1.7e9), tmp_path)
     assert recording.interval == pd.Timedelta("30s")
     assert str(recording.values.index[0]) == "2023-11-14 22:13:20"
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_the_first_reading_at_a_time_counts(beside: bool, tmp_path: Path) -> None:
+    """In the order of the file: beside each other, or where the times begin anew."""
+    table = log(600)
+    twice = pd.concat([table, table.assign(**{f"{name} [m]": 9.0 for name in "abc"})])
+    twice = twice.sort_index(kind="stable") if beside else twice
+    assert np.array_equal(read(twice, tmp_path).values, table.iloc[:, 1:])
 
 
 def test_a_gap_leaves_steps_without_readings(tmp_path: Path) -> None:

@@ -10,11 +10,13 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.task import Task
+from fusion_gym.evaluation import rule_search
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.policy_batch import run_policies, run_priced
+from fusion_gym.evaluation.policy_batch import EpisodeMeans, run_policies, run_priced
 from fusion_gym.evaluation.rule_search import (
     Generation,
     RuleSearch,
+    ThresholdTrial,
     run_generations,
     search_of_class,
     search_result,
@@ -94,6 +96,61 @@ def test_a_resumed_search_is_the_uninterrupted_one() -> None:
         search_result(small(), [])
 
 
+@pytest.fixture
+def seeds(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
+    """The seeds of every batch of a search, whose episodes are not run."""
+    batches: list[set[int]] = []
+
+    def means(seeds: Any) -> EpisodeMeans:
+        batches.append(set(np.asarray(seeds).tolist()))
+        return EpisodeMeans(*np.ones((4, len(seeds))))
+
+    def policies(task: Task, rules: Any, episodes: int, seed: int) -> list[EpisodeMeans]:
+        return [means(seed + np.arange(episodes))] * len(rules)
+
+    monkeypatch.setattr(rule_search, "run_policies", policies)
+    monkeypatch.setattr(rule_search, "run_priced", lambda task, policy, seeds, prices: means(seeds))
+    return batches
+
+
+def test_a_search_runs_no_episode_twice(seeds: list[set[int]]) -> None:
+    """Of the start, of each generation and of the end, which measures both rules on the same."""
+    search_rule(small())
+    phases = [batch for place, batch in enumerate(seeds) if batch not in seeds[:place]]
+    assert [len(batch) for batch in phases] == [16, 4, 5, 6, 8, 32]
+    assert len(set().union(*phases)) == sum(map(len, phases))
+    assert phases[-1] == seeds[-len(PRICES) - 1]
+
+
+@pytest.mark.usefixtures("seeds")
+def test_the_result_is_the_mean_of_the_second_half() -> None:
+    search, zero = small(), np.zeros(len(small().coordinates))
+    means = [zero + value for value in (9.0, 7.0, 0.2, 0.4)]
+    halves = [Generation(place, (), mean.tolist()) for place, mean in enumerate(means)]
+    single = Generation(0, (), (zero + 0.3).tolist())
+    assert search_result(search, halves).policy == search_result(search, [single]).policy
+
+
+def test_a_cost_without_number_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NaN or infinite; other objectives are the mean ratio to the single thresholds."""
+    search = small()
+    singles = [ThresholdTrial("", 1.0, 10.0, error) for error in (0.9, 1.0, 0.0)]
+    search.__dict__["start"] = tuple(singles)  # at the prices .01, .1, 1 they cost 1, 2, 10
+
+    def run(task: Task, policy: Any, seeds: Any, prices: Any) -> EpisodeMeans:
+        error = np.ones(len(seeds))
+        error[policy.numbers.margin[0] > 5.0] = np.nan
+        error[policy.numbers.margin[0] < 0.5] = np.inf
+        return EpisodeMeans(error, error, error, np.zeros(len(seeds)))
+
+    monkeypatch.setattr(rule_search, "run_priced", run)
+    points = np.zeros((3, len(search.coordinates)))
+    points[:, search.coordinates.index("margin")] = 0.0, 2.0, -2.0
+    costs = rule_search._objectives(search, points, 4, 0)
+    assert costs[0] == pytest.approx((1.0 + 0.5 + 0.1) / 3.0)
+    assert np.all((np.array(costs[1:]) > 1e29) & np.isfinite(costs[1:]))
+
+
 def test_trials_are_what_each_policy_does_alone() -> None:
     task, template = task_of(), "value_of_information:threshold={value},at_most=1"
     values = np.geomspace(0.001, 3.0, 6).tolist()
@@ -103,7 +160,9 @@ def test_trials_are_what_each_policy_does_alone() -> None:
         single = run_episodes(task, make_policy(trial.policy, task), 8, 3)
         cost = float((single.error_cost + 0.1 * single.tokens).mean())
         assert trial.cost(0.1) == pytest.approx(cost)
-    with pytest.raises(ConfigurationError, match="template = 'always'"):
+    with pytest.raises(
+        ConfigurationError, match=r"template = 'always' .*: it must be a policy with"
+    ):
         try_thresholds(task, "always", values, 2, 0)
 
 
@@ -129,6 +188,10 @@ def test_the_start_fits_the_margin_to_the_prices() -> None:
     point = dict(zip(search.coordinates, search.first_point(), strict=True))
     assert point["margin_exponent"] == pytest.approx(np.log(20.0) / np.log(100.0))
     assert point["margin"] == pytest.approx(2.0 / 3.0 * np.log(20.0))
+    two = dataclasses.replace(search, prices=PRICES[::2])
+    two.__dict__["start"] = trials[:2]
+    assert two.coordinates == search.coordinates
+    assert two.first_point()[-1] == pytest.approx(np.log(20.0) / np.log(100.0))
     rule: Any = make_policy("priced_threshold:margin=4,margin_exponent=1,price=0.1", task_of())
     same: Any = make_policy("priced_threshold:margin=1,price=0.1", task_of())  # 4 · 0.1 is below 1
     results = [run_policies(task_of(), [policy], 4, 0)[0] for policy in (rule, same)]
@@ -166,7 +229,7 @@ def test_other_scores_are_searched_too(options: dict[str, Any], score: Any) -> N
     ("changes", "message"),
     [
         ({"prices": ()}, "prices = "),
-        ({"prices": (0.1, 0.1)}, "prices = "),
+        ({"prices": (0.1, 0.1)}, r"prices = .* it must be one or more different numbers$"),
         ({"prices": (0.1, -1.0)}, "prices = "),
         ({"generations": 0}, "generations = 0"),
         ({"population": 2}, "population = 2"),

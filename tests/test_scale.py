@@ -187,6 +187,13 @@ def test_short_episodes_keep_two_packets_of_each_sensor() -> None:
     assert short[1] < 0.5 * long[1]
 
 
+def test_prices_reach_over_a_factor_of_two_at_least() -> None:
+    """In four steps two packets of each sensor are more than 60 % of what is sustained."""
+    span = fusion_gym.make_task(LINEAR, horizon=4, **FRONT, **DRIFT).reward.price.span
+    assert span is not None
+    assert span[1] == pytest.approx(2.0 * span[0], rel=0.01)
+
+
 @pytest.mark.parametrize("value", ["open", [2.0, 1.0], [1.0, 1.0], 3.0])
 def test_other_prices_are_refused(value: object) -> None:
     with pytest.raises(ConfigurationError, match="price_range = "):

@@ -299,7 +299,8 @@ def _on_even_times(
     numbers: pd.DataFrame, times: pd.Series, source: str, remarks: list[str]
 ) -> pd.DataFrame:
     """Return the first reading of each channel at each multiple of the most frequent interval."""
-    numbers = numbers[times.notna()].set_index(pd.DatetimeIndex(times.dropna())).sort_index()
+    numbers = numbers[times.notna()].set_index(pd.DatetimeIndex(times.dropna()))
+    numbers = numbers.sort_index(kind="stable")
     twice = int(numbers.index.duplicated().sum())
     remarks += [f"{twice} rows at the time of another: the first reading counts"] if twice else []
     apart = numbers.index.to_series().diff()
