@@ -21,11 +21,15 @@ from what_matters import (
 )
 
 import fusion_gym
+from agents.papers.walk import walk
 from fusion_gym import zoo
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import read
+from fusion_gym.evaluation import record_episode, run_episodes, watch
+from fusion_gym.evaluation.cross_term import cross_terms
+from fusion_gym.evaluation.policy_batch import run_policies, run_priced
 from fusion_gym.policies.base import Rule
 from fusion_gym.policies.belief_rule import BeliefRule
 from fusion_gym.policies.registry import make_policy, policy_maker, policy_names, register_policy
@@ -222,6 +226,27 @@ LIARS: dict[str, tuple[Liar, str]] = {
     "knows_the_truth": (Liar("scheduler", lambda s: dug_up(s, "truth")), HIDDEN),
     "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "lost")), HIDDEN),
 }
+
+
+def loops(task: Task, policy: Any) -> dict[str, Callable[[], Any]]:
+    """Every loop of a policy over an episode."""
+    return {
+        "episodes": lambda: run_episodes(task, policy, 2, 0),
+        "record": lambda: record_episode(task, policy, 0),
+        "search": lambda: run_priced(task, policy, np.arange(2), np.ones(2)),
+        "several": lambda: run_policies(task, [policy, policy], 2, 0),
+        "cross term": lambda: cross_terms(task, task.system, {"policy": policy}, 2, 0),
+        "watch": lambda: list(watch(task, {"policy": policy}, steps=1)),
+        "papers": lambda: next(walk(task, policy, 2, 0)),
+    }
+
+
+def test_every_loop_refuses_signals_outside_the_class() -> None:
+    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", filter="tobit", horizon=3)
+    for loop in loops(task, LIARS["sees_measurements"][0]).values():
+        with pytest.raises(LookupError, match="'innovation' belongs to the class 'own'"):
+            loop()
+
 
 # Those that a signal of another class betrays at once.
 REFUSED = {

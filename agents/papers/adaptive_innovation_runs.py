@@ -15,6 +15,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import decide
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 from fusion_gym.systems.correlated.system import CorrelatedTrackingState, CorrelatedTrackingSystem
 
@@ -81,11 +82,9 @@ def steps(
     batch.seed(runs, (seed + runs % episodes).tolist())
     batch.reset()
     trigger = fusion_gym.make_policy(settings["policy"], task)
-    trigger.reset(batch.num_envs, seed)
-    for number in range(STEPS):
+    for number, event in enumerate(decide(trigger, batch, seed)):
         signals = batch.signals()
         innovation = signals["innovation"][:, 0].copy()
-        event = trigger(signals)
         requests = event.copy()
         for place, lane in enumerate(lanes):
             if lane.rule is not None:

@@ -11,7 +11,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import BATCH
-from fusion_gym.policies.base import Policy, Requests
+from fusion_gym.policies.base import Policy, Requests, decide, owner_of
 
 
 def walk(
@@ -26,10 +26,9 @@ def walk(
         seed: Seed of the first one.
     """
     rule = fusion_gym.make_policy(policy, task) if isinstance(policy, str) else policy
-    batch = EpisodeBatch.seeded(task, episodes, seed)
-    rule.reset(episodes, seed)
-    for _ in range(task.horizon):
-        yield batch, rule(batch.signals())
+    batch = EpisodeBatch.seeded(task, episodes, seed, owner_of(rule))
+    for requests in decide(rule, batch, seed):
+        yield batch, requests
 
 
 def walk_in_parts(

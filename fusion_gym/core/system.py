@@ -5,6 +5,7 @@ One partial order of knowledge classes serves signals, observations and policies
 
 from __future__ import annotations
 
+import copy
 import functools
 import itertools
 from abc import ABC, abstractmethod
@@ -284,10 +285,10 @@ class Signals(Mapping[str, SignalArray]):
         }
 
     def limit(self, refused: Mapping[str, str]) -> Self:
-        """Withhold the signals of ``refused``, names and reasons, and return the signals."""
-        if refused:
-            self._withheld |= refused
-        return self
+        """Return the signals without those of ``refused``, names and reasons."""
+        result = copy.copy(self)
+        result._withheld = {**self._withheld, **refused}
+        return result
 
     def __getitem__(self, name: str) -> SignalArray:
         if name in self._withheld:

@@ -102,6 +102,9 @@ class Task:
                 f"token_cost for {len(self.bucket.cost)} sensors is not allowed: the system has "
                 f"{self.system.sensor_count}"
             )
+        if self.required_policy is not None and self.information == "centre":
+            why = f"with the policy {self.required_policy!r}, which reads the new measurements"
+            raise validation.refusal("information", "centre", "'sensors'", why)
         if self.action == "discrete" and self.access != "single" and self.sensors > _MOST_DISCRETE:
             raise validation.ConfigurationError(
                 f"action = 'discrete' is not allowed with {self.sensors} sensors: it numbers all "

@@ -22,7 +22,7 @@ from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import BATCH
 from fusion_gym.evaluation.intervals import LEVEL, Interval, mean_interval
-from fusion_gym.policies.base import Policy, owner_of, refused_signals
+from fusion_gym.policies.base import Policy, decide, owner_of
 
 
 class CrossTerm(NamedTuple):
@@ -114,11 +114,9 @@ def _run(
     batch = EpisodeBatch(task, episodes, owner_of(policy), system)
     batch.seed(np.arange(episodes), [seed + place for place in range(episodes)])
     batch.reset()
-    policy.reset(episodes, seed)
-    refused = refused_signals(policy, task)
     weights, sums = task.relative_weights[:, 0], np.zeros((4, episodes))
-    for _ in range(task.horizon):
-        outcome = batch.step(policy(batch.signals().limit(refused)))
+    for requests in decide(policy, batch, seed):
+        outcome = batch.step(requests)
         least = batch.reference_error
         squared = [error * error for error in (outcome.error, least, outcome.error - least)]
         sums += np.stack((outcome.granted.mean(0), *(weights @ part for part in squared)))

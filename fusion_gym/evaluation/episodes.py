@@ -13,7 +13,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import orthonormalise
-from fusion_gym.policies.base import Policy, owner_of, refused_signals
+from fusion_gym.policies.base import Policy, decide, owner_of
 
 BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on the machine
 
@@ -141,16 +141,14 @@ def _run_batch(
     task: Task, policy: Policy, episodes: int, seed: int, progress: Callable[[int], Any] | None
 ) -> EpisodeResults:
     batch = EpisodeBatch.seeded(task, episodes, seed, owner_of(policy))
-    policy.reset(episodes, seed)
-    refused = refused_signals(policy, task)
     states, sensors, horizon = len(task.system.state_names), task.sensors, task.horizon
     mse, trace, nees = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
     tokens, denied, returns = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
     rate, requests = np.zeros((sensors, episodes)), np.zeros((sensors, episodes))
     diverged, error_cost = np.zeros(episodes), np.zeros(episodes)
     squared_error = np.empty((horizon, states))
-    for step in range(horizon):
-        outcome = batch.step(policy(batch.signals().limit(refused)))
+    for step, request in enumerate(decide(policy, batch, seed)):
+        outcome = batch.step(request)
         covariance = task.system.fused(batch.delivered)[1]
         squared_error[step] = outcome.squared_error.mean(-1)
         mse += outcome.squared_error.sum(0)
@@ -235,11 +233,9 @@ def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
     """
     validation.integer("seed", seed, at_least=0)
     batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
-    policy.reset(1, seed)
-    refused = refused_signals(policy, task)
     rows: dict[str, list[NDArray[Any]]] = {field.name: [] for field in fields(Trajectory)}
-    for _ in range(task.horizon):
-        outcome = batch.step(policy(batch.signals().limit(refused)))
+    for request in decide(policy, batch, seed):
+        outcome = batch.step(request)
         state = batch.delivered
         mean, covariance = task.system.fused(state)
         rows["truth"].append(task.system.truth(state)[:, 0])

@@ -12,9 +12,9 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.beliefs import Beliefs, Estimate, Owner
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, Requests, owner_of, refused_signals
+from fusion_gym.policies.base import Policy, Requests, decide, guard, owner_of
 from fusion_gym.validation import ConfigurationError
 
 Runs = NDArray[np.int64]
@@ -68,22 +68,10 @@ def run_policies(
             "together: there must be policies, and all must have the same owner"
         )
     runs = len(policies) * episodes
-    for policy in policies:
-        policy.reset(episodes, seed)
-    parts = np.arange(runs).reshape(len(policies), episodes)
-    refused = [refused_signals(policy, task) for policy in policies]
-
-    def requests(signals: Signals) -> Requests:
-        whole = _Whole(signals)
-        request = [
-            policy(whole.part(part).limit(withheld))
-            for policy, part, withheld in zip(policies, parts, refused, strict=True)
-        ]
-        return np.concatenate(request, axis=-1)
-
     batch = _batch(task, owners.pop(), seed + np.arange(runs) % episodes)
-    brief = _run(batch, requests)
-    return [EpisodeMeans(*(values[part] for values in brief)) for part in parts]
+    together = _Together(task, policies)
+    brief = _run(batch, together, seed)
+    return [EpisodeMeans(*(values[part] for values in brief)) for part in together.parts]
 
 
 def run_priced(task: Task, policy: Policy, seeds: Runs, prices: Array) -> EpisodeMeans:
@@ -102,9 +90,7 @@ def run_priced(task: Task, policy: Policy, seeds: Runs, prices: Array) -> Episod
     """
     batch = _batch(task, owner_of(policy), seeds)
     batch.price = np.array(prices, dtype=np.float64)
-    policy.reset(len(seeds), int(seeds[0]))
-    refused = refused_signals(policy, task)
-    return _run(batch, lambda signals: policy(signals.limit(refused)))
+    return _run(batch, policy, int(seeds[0]))
 
 
 def _batch(task: Task, owner: Owner | None, seeds: Runs) -> EpisodeBatch:
@@ -114,16 +100,38 @@ def _batch(task: Task, owner: Owner | None, seeds: Runs) -> EpisodeBatch:
     return batch
 
 
-def _run(batch: EpisodeBatch, requests: Callable[[Signals], Requests]) -> EpisodeMeans:
+def _run(batch: EpisodeBatch, policy: Policy, seed: int) -> EpisodeMeans:
     """Run the first episode of all runs of a batch."""
-    sums, horizon = np.zeros((4, batch.num_envs)), batch.task.horizon
-    for _ in range(horizon):
-        outcome = batch.step(requests(batch.signals()))
+    sums = np.zeros((4, batch.num_envs))
+    for requests in decide(policy, batch, seed):
+        outcome = batch.step(requests)
         squared_error = outcome.squared_error.sum(0)
         step = (outcome.granted.mean(0), squared_error, -outcome.reward_error, outcome.cost)
         for total, values in zip(sums, step, strict=True):
             total += values
-    return EpisodeMeans(*(sums / horizon))
+    return EpisodeMeans(*(sums / batch.task.horizon))
+
+
+class _Together:
+    """Several policies as one, each with an equal part of the runs."""
+
+    knowledge: Knowledge = KNOWLEDGE[-1]
+
+    def __init__(self, task: Task, policies: Sequence[Policy]) -> None:
+        self._policies = policies
+        self._decisions = [guard(policy, task) for policy in policies]
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Divide the runs among the policies, and reset these."""
+        self.parts = np.arange(runs).reshape(len(self._policies), -1)
+        for policy, part in zip(self._policies, self.parts, strict=True):
+            policy.reset(len(part), seed)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Return the requests (sensors, N)."""
+        whole = _Whole(signals)
+        each = zip(self._decisions, self.parts, strict=True)
+        return np.concatenate([decide(whole.part(part)) for decide, part in each], axis=-1)
 
 
 class _Whole:

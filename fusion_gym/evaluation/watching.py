@@ -10,7 +10,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Film, Frame
 from fusion_gym.errors import ConfigurationError
-from fusion_gym.policies.base import Policy, owner_of, refused_signals
+from fusion_gym.policies.base import Policy, Requests, decide, owner_of
 
 _LETTERS = 90  # of a policy's name, above its picture
 
@@ -20,16 +20,15 @@ class _Watched:
     """A policy with its run; ``error`` and ``packets`` are sums over the steps so far."""
 
     name: str
-    policy: Policy
     batch: EpisodeBatch
     film: Film
-    refused: dict[str, str]
+    requests: Iterator[Requests]
     error: float = field(default=0.0)
     packets: int = field(default=0)
     steps: int = field(default=0)
 
     def step(self) -> None:
-        outcome = self.batch.step(self.policy(self.batch.signals().limit(self.refused)))
+        outcome = self.batch.step(next(self.requests))
         self.film.record(self.batch, outcome)
         self.error += float(outcome.squared_error.sum())
         self.packets += int(outcome.granted.sum())
@@ -80,10 +79,9 @@ def watch(
     watched = []
     for name, policy in policies.items():
         batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
-        policy.reset(1, seed)
         film = Film(task, 1)
         film.begin()
-        watched.append(_Watched(name, policy, batch, film, refused_signals(policy, task)))
+        watched.append(_Watched(name, batch, film, decide(policy, batch, seed)))
     return _frames(watched, task.horizon if steps is None else steps)
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol, get_args
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.signals import MEMORY_SIGNALS, PLANNING_SIGNALS
 from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signal, Signals, covers, least_covering
@@ -73,6 +74,32 @@ def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
         for name, signal in least.items()
         if not signal.known_to(knower)
     }
+
+
+def guard(policy: Policy, task: Task) -> Callable[[Signals], Requests]:
+    """Return the policy as a function that cannot read signals outside its declared knowledge."""
+    refused = refused_signals(policy, task)
+    return lambda signals: policy(signals.limit(refused))
+
+
+def decide(policy: Policy, batch: EpisodeBatch, seed: int) -> Iterator[Requests]:
+    """Yield a policy's requests (sensors, N) before each step of an episode; the caller steps.
+
+    This is the one loop of a policy over an episode. The policy reads no signal outside its
+    declared knowledge.
+
+    Args:
+        policy: The policy, which is reset first.
+        batch: Runs at the start of an episode, with the memory of :func:`owner_of` the policy.
+        seed: Seed of a policy that draws.
+
+    Raises:
+        LookupError: The policy uses a signal outside its knowledge, or one that the task withholds.
+    """
+    policy.reset(batch.num_envs, seed)
+    decision = guard(policy, batch.task)
+    for _ in range(batch.task.horizon):
+        yield decision(batch.signals())
 
 
 def is_stateless(policy: Policy) -> bool:

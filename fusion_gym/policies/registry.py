@@ -19,7 +19,7 @@ from fusion_gym.core.system import KNOWLEDGE, SignalError
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.importing import TRUST, import_named
-from fusion_gym.policies.base import Policy, owner_of, refused_signals
+from fusion_gym.policies.base import Policy, guard, owner_of
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys, refusal
 
@@ -311,7 +311,7 @@ def _try_out(spec: str, policy: Policy, task: Task) -> None:
     batch.reset()
     policy.reset(1)
     try:
-        requests = policy(batch.signals().limit(refused_signals(policy, task)))
+        requests = guard(policy, task)(batch.signals())
     except (SignalError, ConfigurationError) as error:
         raise ConfigurationError(f"policy {spec!r}: {error.args[0]}") from None
     policy.reset(1)

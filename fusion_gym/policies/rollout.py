@@ -11,7 +11,7 @@ from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, Requests, is_stateless, owner_of, refused_signals
+from fusion_gym.policies.base import Policy, Requests, guard, is_stateless, owner_of
 from fusion_gym.policies.belief_rule import check_owner, knows
 from fusion_gym.policies.imagination import Imagination
 from fusion_gym.policies.registry import make_policy
@@ -111,7 +111,7 @@ class Rollout:
             )
         memory = Memory(task, "scheduler")
         self._task = task
-        self._refused = refused_signals(self.base, task)
+        self._decision = guard(self.base, task)
         self._weights = task.reward.error_weight * task.reward.state_weights
         self._imagination = Imagination(task, memory, ObservationLayout(task))
         self.reset(0)
@@ -133,7 +133,7 @@ class Rollout:
         runs = len(signals["tokens"])
         if len(self._generators) != runs:
             self.reset(runs)
-        choices, own = self._choices(np.asarray(self.base(signals)))
+        choices, own = self._choices(np.asarray(self._decision(signals)))
         size = max(1, _LANES // (len(choices) * self.samples))
         best = np.empty(runs, dtype=np.int64)
         for first in range(0, runs, size):
@@ -183,5 +183,5 @@ class Rollout:
             cost += (self._weights * missed * missed).sum(0) + price * spent
             if step < self.steps:
                 branch.sense(noise[step].take(lanes, axis=-1))
-                requests = np.asarray(self.base(branch.signals().limit(self._refused)))
+                requests = np.asarray(self._decision(branch.signals()))
         return cost.reshape(count, len(runs), samples)

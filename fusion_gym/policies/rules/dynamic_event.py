@@ -59,8 +59,8 @@ class DynamicEvent(LocalRule):
     random_start=True token_rate=2``.
     """
 
-    threshold: PerSensor = parameter((0.1, 0.2, 0.3), not_negative_parameter)
-    decay: PerSensor = parameter((0.1, 0.2, 0.1), not_negative_parameter)
+    threshold: PerSensor = parameter(0.2, not_negative_parameter)
+    decay: PerSensor = parameter(0.1, not_negative_parameter)
     divisor: PerSensor = parameter(5.0, each_number, above=0.0)
     initial: PerSensor = parameter(1.5, not_negative_parameter)
     scale: float = parameter(1.0, validation.number, at_least=0.0)
