@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -18,7 +19,7 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.evaluation import run_episodes
-from fusion_gym.jax import FunctionalEnv
+from fusion_gym.jax import FiveValueEnv, FunctionalEnv
 from fusion_gym.validation import ConfigurationError
 
 HORIZON, EPISODES = 30, 3
@@ -210,6 +211,7 @@ def test_what_jax_does_not_run_is_refused(name: str, options: dict[str, Any], fi
         gymnasium.make(f"fusion_gym/{name}", backend="jax", **options)
 
 
+LINEAR = "fusion_gym/LinearFusion-v2"
 SMALL = "fusion_gym/RemoteEstimation-v1"  # compiles soonest
 ACTION = np.array([1])
 MAKERS: dict[str, Callable[..., Any]] = {
@@ -217,6 +219,62 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "vector": partial(gymnasium.make_vec, num_envs=2, vectorization_mode="vector_entry_point"),
     "sb3": partial(fusion_gym.make_sb3_vec_env, num_envs=2),
 }
+
+
+def test_resets_and_steps_draw_from_independent_keys() -> None:
+    """A reset takes its noise and its price, a step its noise and its reset, from a key each."""
+    env, params = fusion_gym.jax.make(
+        SMALL, horizon=1, initial_deviation=1.0, cost_weight="random", price_range=(1.0, 9.0)
+    )
+    system, keys = env.task.system, jax.random.split(jax.random.key(0))
+    start, channels = system.start_channels, system.noise_channels
+    normals = jax.random.normal(keys[0], (start + channels, 1))
+    uniform = jax.random.uniform(keys[1], (1,))
+    first = env.reset(jax.random.key(0), params)
+    expected = jax.jit(env.reset_env)(normals[:start], normals[start:], uniform, params)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), first, expected)
+    _, renewed, reward, *_, info = env.step(jax.random.key(0), first[1], ACTION, params)
+    noise = jax.random.normal(keys[0], (channels, 1))
+    observation, _, outcome = jax.jit(env.step_env)(noise, first[1], ACTION, params)
+    np.testing.assert_allclose(reward, outcome.reward[0], rtol=1e-12)
+    np.testing.assert_allclose(info["final_observation"], observation, rtol=1e-6)
+    again = env.reset(keys[1], params)[1]
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), renewed, again)
+
+
+@pytest.mark.parametrize("options", [{"action": "discrete"}, {"access": "single"}, {}])
+def test_requests_are_those_of_the_usual_interfaces(options: dict[str, Any]) -> None:
+    env = fusion_gym.jax.make(SMALL, sensors=3, **options)[0]
+    numbers = np.arange(env.num_actions)
+    actions = numbers if options else [[0, 0, 1], [1, 0, 0], [1, 1, 0]]
+    for action in actions:
+        np.testing.assert_array_equal(env.requests(action), env._view.requests(action, None))
+
+
+def test_the_earlier_interface_is_done_at_a_termination() -> None:
+    env = FiveValueEnv(fusion_gym.make_task(SMALL, horizon=1, clock=True))
+    key = jax.random.key(0)
+    *_, done, info = env.step(key, env.reset(key)[1], ACTION)
+    assert (done, info["terminated"], info["truncated"]) == (True, True, False)
+
+
+def test_positions_are_few_arrays_that_one_thread_computes() -> None:
+    """The limit on rows changes the speed only."""
+    six = np.eye(6).tolist()
+    task = fusion_gym.make_task(
+        LINEAR, transition=six, process_covariance=six, measurement_matrices=[six], backend="jax"
+    )
+    batch = EpisodeBatch.seeded(task, 1, 0)
+    assert batch._program is not None
+    arrays = batch._program.pack(batch.position())
+    sizes = [array.nbytes for array in arrays]
+    assert max(sizes) <= 512
+    assert min(a + b for a, b in pairwise(sizes)) > 256
+
+
+def test_the_filter_of_silence_takes_parameters() -> None:
+    env, params = fusion_gym.jax.make(TOBIT, filter="stochastic", stochastic_weight=1.0)
+    jax.eval_shape(env.reset, jax.random.key(0), params)
 
 
 @pytest.mark.parametrize("kind", MAKERS)
