@@ -83,11 +83,9 @@ class FunctionalEnv:
         (2, (13,))
     """
 
-    task: Task
-
     def __init__(self, task: Task) -> None:
-        task = dataclasses.replace(task, backend="jax")
-        self.__setstate__({"task": task})
+        self.task = task = dataclasses.replace(task, backend="jax")
+        self.__setstate__({})
         system = task.system
         self._memory, self._layout = Memory(task, "scheduler"), ObservationLayout(task)
         self._view = SchedulerView(task)

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,8 @@ from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Outcome, Position
 from fusion_gym.core.task import Task
+from fusion_gym.core.token_bucket import Queue
 from fusion_gym.importing import require
-
-if TYPE_CHECKING:
-    from fusion_gym.core.token_bucket import Queue
 
 require("an environment under JAX", "jax", "jax")
 import jax  # noqa: E402
