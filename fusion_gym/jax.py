@@ -36,7 +36,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 from jax.custom_batching import custom_vmap  # noqa: E402
 
-from fusion_gym.core.compiled import register_state  # noqa: E402
+from fusion_gym.core.compiled import refuse_in_forks, register_state  # noqa: E402
 
 
 class EnvParams(NamedTuple):
@@ -85,8 +85,8 @@ class FunctionalEnv:
 
     def __init__(self, task: Task) -> None:
         self.task = task = dataclasses.replace(task, backend="jax")
+        self.__setstate__({})
         system = task.system
-        register_state(system.start(np.zeros((system.start_channels, 1))))
         self._memory, self._layout = Memory(task, "scheduler"), ObservationLayout(task)
         self._view = SchedulerView(task)
         self._channels = system.noise_channels + (task.access == "random")
@@ -100,6 +100,11 @@ class FunctionalEnv:
                 system.centre.sensors.variance[..., 0],
                 None if shares is None else shares[:, 0],
             )
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        system = self.task.system
+        register_state(system.start(np.zeros((system.start_channels, 1))))
 
     @property
     def name(self) -> str:
@@ -346,6 +351,9 @@ def _for_one_run(function: Callable[..., Any]) -> Callable[..., Any]:
     differentiable = jax.custom_vjp(mapped)  # custom_vmap has no derivatives
     differentiable.defvjp(lambda *values: jax.vjp(depending, *values), lambda f, g: f(g))
     return differentiable
+
+
+refuse_in_forks(FunctionalEnv, "reset", "step", "reset_env", "step_env", "expected_step", "signals")
 
 
 class FiveValueEnv(FunctionalEnv):

@@ -5,9 +5,9 @@ A quantity of shape S for N runs is an array of shape ``(*S, N)``: a matrix is
 batch axis of length 1 broadcast as in NumPy, so a constant matrix has the shape ``(n, m, 1)``.
 
 Every routine is a short sequence of element-wise operations of NumPy or JAX along the two small
-axes. NumPy's large matrices use BLAS and LAPACK, run by run. The floating-point
-operations of a run do not depend on the number of runs, so its result is bitwise the same in every
-batch.
+axes. NumPy's large matrices use BLAS and LAPACK, run by run, and JAX's use LAPACK from three rows
+on, because an elimination takes long to compile. The floating-point operations of a run do not
+depend on the number of runs, so its result is bitwise the same in every batch.
 
 The routines for symmetric positive definite matrices (`cholesky`, `solve`, `solve_vector`,
 `inverse`) read only the diagonal and the lower triangle. They first
@@ -282,7 +282,15 @@ def cholesky(a: FloatArray) -> FloatArray:
 def whiten(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return ``L^-1 b`` (..., n, m, N) with L the Cholesky factor of `a`."""
     work, scale = _equilibrate(a)
-    return _eliminate(work, b * scale[..., :, None, :])[1]
+    right = b * scale[..., :, None, :]
+    if a.shape[-2] < 3 or namespace(a, b) is np:
+        return _eliminate(work, right)[1]
+    from jax.scipy.linalg import solve_triangular
+
+    xp, right = namespace(right), namespace(right).moveaxis(right, -1, -3)
+    factor = xp.linalg.cholesky(xp.moveaxis(work, -1, -3), symmetrize_input=False)
+    factor = xp.broadcast_to(factor, (*right.shape[:-2], *factor.shape[-2:]))
+    return xp.moveaxis(solve_triangular(factor, right, lower=True), -3, -1)
 
 
 @np.errstate(all="ignore")
@@ -369,6 +377,10 @@ def solve(a: FloatArray, b: FloatArray) -> FloatArray:
         x = scaled - correlation[..., None, None, :] * scaled[..., ::-1, :, :]
         x *= weight[..., :, None, :]
         return x
+    if xp is not np:
+        every = xp.broadcast_to(identity(size), (*b.shape[:-2], size, b.shape[-1]))
+        both = whiten(a, xp.concatenate([every, b], axis=-2))
+        return matmul(transpose(both[..., :size, :]), both[..., size:, :])
     work, scale = _equilibrate(a)
     work, x, _ = _eliminate(work, b * scale[..., :, None, :])
     for k in range(size - 1, -1, -1):
@@ -432,6 +444,8 @@ def inverse(a: FloatArray) -> FloatArray:
         result = outer(weight, weight)
         result = update_at(np.multiply, result, (..., 0, 1, _ALL), -correlation)
         return set_at(result, (..., 1, 0, _ALL), result[..., 0, 1, :])
+    if xp is not np:
+        return gram(transpose(whiten(a, identity(size))))
     work, scale = _equilibrate(a)
     if size >= _LARGE and xp is np:
         return _by_lane(_inverse_of_stack, work) * outer(scale, scale)

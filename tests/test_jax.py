@@ -1,7 +1,12 @@
 """Environments as pure functions of JAX: NumPy's results on the same noise, and autoresets."""
 
+import copy
+import multiprocessing
+import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -14,7 +19,7 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.evaluation import run_episodes
-from fusion_gym.jax import FunctionalEnv
+from fusion_gym.jax import FiveValueEnv, FunctionalEnv
 from fusion_gym.validation import ConfigurationError
 
 HORIZON, EPISODES = 30, 3
@@ -204,3 +209,156 @@ def test_what_jax_does_not_run_is_refused(name: str, options: dict[str, Any], fi
         fusion_gym.jax.make(f"fusion_gym/{name}", **options)
     with pytest.raises(ConfigurationError, match=rf"^{field} = .* is not allowed under JAX"):
         gymnasium.make(f"fusion_gym/{name}", backend="jax", **options)
+
+
+LINEAR = "fusion_gym/LinearFusion-v2"
+SMALL = "fusion_gym/RemoteEstimation-v1"  # compiles soonest
+ACTION = np.array([1])
+MAKERS: dict[str, Callable[..., Any]] = {
+    "single": gymnasium.make,
+    "vector": partial(gymnasium.make_vec, num_envs=2, vectorization_mode="vector_entry_point"),
+    "sb3": partial(fusion_gym.make_sb3_vec_env, num_envs=2),
+}
+
+
+def test_resets_and_steps_draw_from_independent_keys() -> None:
+    """A reset takes its noise and its price, a step its noise and its reset, from a key each."""
+    env, params = fusion_gym.jax.make(
+        SMALL, horizon=1, initial_deviation=1.0, cost_weight="random", price_range=(1.0, 9.0)
+    )
+    system, keys = env.task.system, jax.random.split(jax.random.key(0))
+    start, channels = system.start_channels, system.noise_channels
+    normals = jax.random.normal(keys[0], (start + channels, 1))
+    uniform = jax.random.uniform(keys[1], (1,))
+    first = env.reset(jax.random.key(0), params)
+    expected = jax.jit(env.reset_env)(normals[:start], normals[start:], uniform, params)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), first, expected)
+    _, renewed, reward, *_, info = env.step(jax.random.key(0), first[1], ACTION, params)
+    noise = jax.random.normal(keys[0], (channels, 1))
+    observation, _, outcome = jax.jit(env.step_env)(noise, first[1], ACTION, params)
+    np.testing.assert_allclose(reward, outcome.reward[0], rtol=1e-12)
+    np.testing.assert_allclose(info["final_observation"], observation, rtol=1e-6)
+    again = env.reset(keys[1], params)[1]
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), renewed, again)
+
+
+@pytest.mark.parametrize("options", [{"action": "discrete"}, {"access": "single"}, {}])
+def test_requests_are_those_of_the_usual_interfaces(options: dict[str, Any]) -> None:
+    env = fusion_gym.jax.make(SMALL, sensors=3, **options)[0]
+    numbers = np.arange(env.num_actions)
+    actions = numbers if options else [[0, 0, 1], [1, 0, 0], [1, 1, 0]]
+    for action in actions:
+        np.testing.assert_array_equal(env.requests(action), env._view.requests(action, None))
+
+
+def test_the_earlier_interface_is_done_at_a_termination() -> None:
+    env = FiveValueEnv(fusion_gym.make_task(SMALL, horizon=1, clock=True))
+    key = jax.random.key(0)
+    *_, done, info = env.step(key, env.reset(key)[1], ACTION)
+    assert (done, info["terminated"], info["truncated"]) == (True, True, False)
+
+
+def test_positions_are_few_arrays_that_one_thread_computes() -> None:
+    """The limit on rows changes the speed only."""
+    six = np.eye(6).tolist()
+    task = fusion_gym.make_task(
+        LINEAR, transition=six, process_covariance=six, measurement_matrices=[six], backend="jax"
+    )
+    batch = EpisodeBatch.seeded(task, 1, 0)
+    assert batch._program is not None
+    arrays = batch._program.pack(batch.position())
+    sizes = [array.nbytes for array in arrays]
+    assert max(sizes) <= 512
+    assert min(a + b for a, b in pairwise(sizes)) > 256
+
+
+def test_the_filter_of_silence_takes_parameters() -> None:
+    env, params = fusion_gym.jax.make(TOBIT, filter="stochastic", stochastic_weight=1.0)
+    jax.eval_shape(env.reset, jax.random.key(0), params)
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_copies_continue_as_the_original(kind: str) -> None:
+    """After a reset, and after steps; the last observation stays that of JAX."""
+    env = MAKERS[kind](
+        SMALL, sensors=2, backend="jax", horizon=4, cost_weight="random", price_range=(1.0, 9.0)
+    )
+    actions = np.array([1, 0] if kind == "single" else [[1, 0], [1, 1]])
+    pickle.loads(pickle.dumps(env)).reset()
+    env.reset()
+    for _ in range(2):
+        twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+        batches = [getattr(e, "unwrapped", e).batch for e in (env, *twins)]
+        assert len({batch.observe().tobytes() for batch in batches}) == 1
+        expected, *others = [[e.step(actions)[:3] for _ in range(2)] for e in (env, *twins)]
+        for other in others:
+            jax.tree.map(np.testing.assert_array_equal, other, expected)
+
+
+def test_functional_environments_are_copied() -> None:
+    env, params = fusion_gym.jax.make(SMALL)
+    key = jax.random.key(0)
+    state = env.reset(key, params)[1]
+    expected = env.step(key, state, ACTION, params)
+    for other, start in (copy.deepcopy((env, state)), pickle.loads(pickle.dumps((env, state)))):
+        result = other.step(key, start, ACTION, params)
+        jax.tree.map(np.testing.assert_array_equal, result, expected)
+
+
+@pytest.mark.slow
+def test_workers_take_environments() -> None:
+    """A new process knows neither the environment's state class nor its program."""
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    env = gymnasium.make(SMALL, backend="jax")
+    env.reset(seed=3)
+    expected = env.step(ACTION)[0]
+    pure, params = fusion_gym.jax.make(SMALL)
+    key = jax.random.PRNGKey(0)
+    state = pure.reset(key, params)[1]
+    envs = SubprocVecEnv(
+        [lambda: (pure.step(key, state, ACTION, params), env)[1]], start_method="spawn"
+    )
+    try:
+        envs.seed(3)
+        envs.reset()
+        np.testing.assert_array_equal(envs.step(ACTION[None])[0], expected[None])
+    finally:
+        envs.close()
+
+
+def test_a_fork_of_a_process_that_has_run_jax_is_refused() -> None:
+    env = gymnasium.make(SMALL, backend="jax")
+    env.reset(seed=0)
+    env.step(ACTION)
+    pure, params = fusion_gym.jax.make(SMALL)
+    key = jax.random.key(0)
+    state = pure.reset(key, params)[1]
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+
+    def child() -> None:
+        jobs: list[Callable[[], Any]] = [
+            lambda: env.step(ACTION),
+            lambda: pure.reset(key, params),
+            lambda: pure.step(key, state, ACTION, params),
+            lambda: gymnasium.make_vec(SMALL, 3, backend="numpy").reset()[0].shape,
+        ]
+        for job in jobs:
+            try:
+                sender.send(str(job()))
+            except RuntimeError as error:
+                sender.send(str(error))
+
+    process = context.Process(target=child)
+    with pytest.warns(RuntimeWarning, match="fork"):
+        process.start()
+    try:
+        lines = [receiver.recv() for _ in range(4) if receiver.poll(20.0)]
+    finally:
+        process.kill()
+    assert len(lines) == 4
+    assert all(
+        line.startswith("JAX may hang in a fork") and "'spawn'" in line for line in lines[:3]
+    )
+    assert lines[3] == "(3, 3)"

@@ -49,7 +49,7 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
     "upper_tail": (gaussian.upper_tail, (ENDS,)),
     "erfcx": (namespace.erfcx, (ENDS[ENDS > -30.0],)),
 }
-for n in (1, 2, 4):
+for n in (1, 2, 4, 9):
     matrix, vector = definite(n), vectors(n)
     for function in (linalg.cholesky, linalg.inverse, linalg.symmetrise, linalg.trace, linalg.gram):
         CASES[f"{function.__name__}-{n}"] = function, (matrix,)

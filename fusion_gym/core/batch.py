@@ -17,7 +17,7 @@ from fusion_gym.core.beliefs import Owner, arrived
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import Branch, Lazy, Outcome, Runs, value_of
+from fusion_gym.core.runs import Lazy, Outcome, Runs, value_of
 from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
@@ -211,19 +211,21 @@ class EpisodeBatch(Runs):
         self.memory = self.memory.with_states(moving.pop("memory_states"))
         vars(self).update(moving)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_rows": []}  # whose form only the program knows
+
     def _compiled(self) -> CompiledStep:
         from fusion_gym.core.compiled import CompiledStep
 
         if self.memory.states is not None:
             raise refusal("backend", "jax", "'numpy' with memory or the beliefs of local sensors")
-        memory = Memory(self.task, self.memory.owner)
-        return CompiledStep(lambda position: Branch(self.task, memory, self.layout, position))
+        return CompiledStep(self.task, Memory(self.task, self.memory.owner), self.layout)
 
     def _run_program(self, requests: NDArray[np.bool_]) -> Outcome:
         """Make both halves of a step under JAX."""
         program, before, system = self._program, self._state, self.task.system
         assert program is not None
-        if before is not self._computed:
+        if before is not self._computed or not self._rows:
             self._rows = program.pack(self.position())
         self.steps = self.steps + 1
         self._move()

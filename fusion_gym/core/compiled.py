@@ -8,23 +8,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.memory import Memory
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.runs import Branch, Outcome, Position
+from fusion_gym.core.task import Task
+from fusion_gym.core.token_bucket import Queue
 from fusion_gym.importing import require
-
-if TYPE_CHECKING:
-    from fusion_gym.core.runs import Branch, Outcome, Position
-    from fusion_gym.core.token_bucket import Queue
 
 require("an environment under JAX", "jax", "jax")
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
+from jax._src.xla_bridge import backends_are_initialized  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_cpu_enable_async_dispatch", False)  # threads cost more than a step
@@ -44,6 +46,23 @@ def register_state(state: Any) -> None:
         jax.tree_util.register_dataclass(type(state), names, [])
 
 
+def refuse_in_forks(owner: type, *methods: str) -> None:
+    """Make methods raise in a fork of a process that has run JAX, whose threads are absent."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise RuntimeError(
+            "JAX may hang in a fork of a process that has run it: use the start method 'spawn' or "
+            "backend='numpy'"
+        )
+
+    def forked() -> None:
+        for method in methods if backends_are_initialized() else ():
+            setattr(owner, method, refuse)
+
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=forked)
+
+
 class Result(NamedTuple):
     """The outcome of a step, and the tokens, queue and observations (entries, N) after it."""
 
@@ -57,14 +76,23 @@ class CompiledStep:
     """A step and its observation, with few arrays of float64 in and out.
 
     JAX takes longer to pass many arrays than to compute a step of one run, so the entries of a
-    position are rows of few arrays, of which NumPy's positions have views.
+    position are rows of few arrays, of which NumPy's positions have views. A copy begins at
+    :meth:`pack`.
 
     Args:
-        branch: Function that returns the runs at a position, which JAX traces.
+        task: The task.
+        memory: A memory without states.
+        layout: The layout of the observation.
     """
 
-    def __init__(self, branch: Callable[[Position], Branch]) -> None:
-        self._branch, self._program = branch, jax.jit(self._trace)
+    def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
+        self._runs, self._program = (task, memory, layout), jax.jit(self._trace)
+
+    def __reduce__(self) -> Any:
+        return type(self), self._runs
+
+    def __deepcopy__(self, memo: Any) -> CompiledStep:
+        return self  # what it has compiled fits the copy
 
     def pack(self, position: Position) -> Any:
         """Return the rows of a position, a list of arrays (rows, N)."""
@@ -84,11 +112,14 @@ class CompiledStep:
         return self._position.unpack(rows)
 
     def _trace(self, rows: Any, requests: Any, noise: Any) -> tuple[list[Any], list[Any]]:
-        runs = self._branch(self._position.unpack(rows))
+        runs = Branch(*self._runs, self._position.unpack(rows))
         outcome = runs.step(requests, noise)
         result = Result(outcome, runs.tokens, runs.queue, runs.observe().T)
         self._result = _Rows(result)
         return self._position.pack(jnp, runs.position()), self._result.pack(jnp, result)
+
+
+refuse_in_forks(CompiledStep, "__call__")
 
 
 class _Rows:

@@ -85,6 +85,9 @@ class Lazy:
         """The value."""
         return self._compute()
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {"value": self.value}
+
 
 def value_of(value: Any) -> Any:
     """Return the value of a :class:`Lazy`, and any other value as it is."""

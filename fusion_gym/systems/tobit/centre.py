@@ -280,7 +280,7 @@ class FederatedCentre(NodeCentre):
         deviation = _deviation(sensors, expectation, (observed * observed).sum(-2))
         if weight is not None:
             # Both sides times √Z, so that weight 0 is no exception.
-            scale = np.sqrt(weight / (1.0 + weight * sensors.variance[..., 0]))[..., None, None]
+            scale = ((weight / (1.0 + weight * sensors.variance[..., 0])) ** 0.5)[..., None, None]
             nothing = 0.0 * expectation.value
             _, silent = joint_update(_stack(scale * observed), _stack(nothing))
             root = linalg.matmul(root, linalg.root(silent))
