@@ -27,7 +27,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpstrf
 from fusion_gym.namespace import namespace, set_at, update_at
 
 FloatArray = NDArray[np.float64]
-_MANY = 8  # rows from which on a test for a diagonal matrix saves time
+_MANY = 8  # rows from which on NumPy sums in pairs, and a test for a diagonal matrix saves time
 _LARGE = 16  # rows from which on BLAS and LAPACK are faster than element-wise operations
 _ROUNDING = 2e-15  # relative rounding error of a difference of variances, per row
 _CHUNK = 32  # runs per transposition, which then stays in the cache
@@ -47,6 +47,17 @@ def transpose(a: FloatArray) -> FloatArray:
 def diagonal(a: FloatArray) -> FloatArray:
     """Return the diagonal ``(..., n, N)`` of ``(..., n, n, N)``, a read-only view."""
     return a.diagonal(0, -3, -2).swapaxes(-1, -2)
+
+
+def total(a: FloatArray, axis: int = -2) -> FloatArray:
+    """Return the sum over an axis that is not the last, in ascending order for every N.
+
+    NumPy sums eight or more numbers of a contiguous axis in pairs, so alone where N is 1.
+    """
+    if a.shape[-1] > 1 or a.shape[axis] < _MANY or namespace(a) is not np:
+        result: FloatArray = a.sum(axis)
+        return result
+    return a.cumsum(axis).take(-1, axis)
 
 
 def trace(a: FloatArray) -> FloatArray:

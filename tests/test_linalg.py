@@ -247,3 +247,17 @@ def test_a_lane_is_the_same_alone_and_in_the_batch(seed: int, n: int, count: int
         linalg.quadratic(v, a)[..., lane], linalg.quadratic(vector, item)[..., 0]
     )
     np.testing.assert_array_equal(linalg.dot(v, v)[..., lane], linalg.dot(vector, vector)[..., 0])
+
+
+@pytest.mark.parametrize("count", [3, 8, 21])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_sum_has_one_order_in_every_batch(count: int, axis: int) -> None:
+    shape = [2, 3, 4, 5]
+    shape[axis] = count
+    terms = np.random.default_rng(0).normal(size=shape)
+    for order in ((0, 1, 2), (2, 0, 1)):  # also of views
+        values, place = terms.transpose(*order, 3), order.index(axis)
+        lanes = [linalg.total(values[..., lane : lane + 1], place) for lane in range(5)]
+        together = linalg.total(values, place)
+        np.testing.assert_array_equal(together, np.concatenate(lanes, axis=-1))
+        np.testing.assert_allclose(together, values.sum(place), rtol=0.0, atol=1e-13)

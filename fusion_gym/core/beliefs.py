@@ -26,6 +26,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_gym import linalg
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
@@ -155,7 +156,7 @@ class Beliefs(ABC):
         return gain if self.arrival is None else self.arrival * gain
 
     def _weighted(self, difference: Array) -> Array:
-        return (self.task.relative_weights * (difference * difference)).sum(-2)
+        return linalg.total(self.task.relative_weights * (difference * difference))
 
     def _no_packets(self, runs: int) -> Packets:
         return np.zeros((self.task.sensors, runs), dtype=np.bool_)
@@ -200,7 +201,8 @@ class SchedulerBeliefs(Beliefs):
         """Return ‖x* - x̂‖² (1, N), summed over ``steps`` steps without noise and transmissions."""
         if steps == 1:
             return super().loss()
-        return self._weighted(self._path(self._silent, steps) - self._best_path(steps)).sum(0)[None]
+        apart = self._path(self._silent, steps) - self._best_path(steps)
+        return linalg.total(self._weighted(apart))[None]
 
     def value(self, steps: int = 1) -> Array:
         """Return v(s) (sensors, N), summed over ``steps`` steps without noise and transmissions."""
@@ -211,7 +213,7 @@ class SchedulerBeliefs(Beliefs):
             left = np.zeros((self.task.sensors, self._runs))
         else:
             left = np.stack(
-                [self._weighted(self._path(sent, steps) - best).sum(0) for sent in self._sent]
+                [linalg.total(self._weighted(self._path(s, steps) - best)) for s in self._sent]
             )
         return self._expected(self.loss(steps), left)
 

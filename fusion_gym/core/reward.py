@@ -162,9 +162,9 @@ class Reward:
 
     def _error_cost(self, error: Array, covariance: Array) -> Array:
         if self.error == "squared":
-            return (self.state_weights * (error * error)).sum(0)
+            return linalg.total(self.state_weights * (error * error))
         if self.error == "trace":
-            return (self.state_weights * linalg.diagonal(covariance)).sum(0)
+            return linalg.total(self.state_weights * linalg.diagonal(covariance))
         if self.error == "maximum":
             return (self.state_weights * (error * error)).max(0)
         assert not isinstance(self.error, str)

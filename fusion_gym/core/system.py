@@ -285,7 +285,7 @@ class Signals(Mapping[str, SignalArray]):
         }
 
     def limit(self, refused: Mapping[str, str]) -> Self:
-        """Return the signals without those of ``refused``, names and reasons."""
+        """Return the signals without the ``refused`` ones, names and reasons."""
         result = copy.copy(self)
         result._withheld = {**self._withheld, **refused}
         return result

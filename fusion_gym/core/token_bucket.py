@@ -10,7 +10,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import validation
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import SharingRule
 from fusion_gym.namespace import namespace, permute, ranked_sum, take_rows
@@ -168,8 +168,7 @@ class TokenBucket:
             granted = self._grant_by_queue(tokens, requests, queue)
         else:
             granted = self._grant_in_order(tokens, requests, step)
-        paid = granted * self.cost  # np.sum reorders 8 or more terms if N is 1
-        spent = paid.sum(0) if len(paid) < 8 else xp.cumsum(paid, axis=0)[-1]
+        spent = linalg.total(granted * self.cost)
         if not self.unlimited:
             tokens = xp.minimum(xp.maximum(tokens + self.rate - spent, 0.0), self.capacity)
         return Grants(granted, spent, tokens, move_to_end(queue, granted))

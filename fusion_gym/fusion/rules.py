@@ -156,8 +156,8 @@ class InformationFusion(FusionRule):
             xp = namespace(active, information)
             information = xp.where(active[:, None, None], information, 0.0)
             means = xp.where(active[:, None], means, 0.0)
-        fused = linalg.inverse(information.sum(0))
-        mean = linalg.matvec(fused, linalg.matvec(information, means).sum(0))
+        fused = linalg.inverse(linalg.total(information, 0))
+        mean = linalg.matvec(fused, linalg.total(linalg.matvec(information, means), 0))
         return Fused(mean, fused, lambda: linalg.matmul(fused, information))
 
     def fuse_single(
@@ -165,7 +165,7 @@ class InformationFusion(FusionRule):
     ) -> tuple[Array, Array]:
         """Return fused covariances from sums of informations."""
         information = linalg.inverse(silent)
-        total = information.sum(0)
+        total = linalg.total(information, 0)
         gained = linalg.inverse(delivered) - information
         return linalg.inverse(total), linalg.inverse(total + gained)
 
@@ -220,7 +220,7 @@ class MatrixWeightedFusion(FusionRule):
             definite = linalg.add_diagonal(definite, ridge[:, lanes])
             solved[..., lanes] = linalg.solve(definite, toward[..., lanes])
         weights[1:] = -linalg.transpose(solved.reshape(count - 1, n, n, runs))
-        weights[0] -= weights[1:].sum(0)
+        weights[0] -= linalg.total(weights[1:], 0)
         return weights
 
     def fuse(

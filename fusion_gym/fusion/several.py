@@ -132,7 +132,7 @@ def covariance_intersection_many(
         taking_part = _at(selected, lanes)
         start = taking_part / np.abs(_at(linalg.trace(covariances), lanes))
         np.copyto(start, 0.0, where=~taking_part)
-        start /= sum_rows(start)
+        start /= linalg.total(start, 0)
         weights[:, lanes], fused[..., lanes] = _search(
             _at(information, lanes), _at(metric, lanes), start
         )
@@ -147,7 +147,7 @@ def covariance_intersection_many(
             own, taking_part, _at(metric, lanes)
         )
         known = np.where(taking_part[:, None], _at(means, lanes), 0.0)
-        joined[:, lanes] = sum_rows(linalg.matvec(part, known))
+        joined[:, lanes] = linalg.total(linalg.matvec(part, known), 0)
 
     def gains() -> Array:
         every = linalg.matmul(fused, weights[:, None, None] * information)
@@ -194,7 +194,7 @@ def _constrained(
     weights, inside = _search(information, linalg.matmul(basis, root), start)
     part = linalg.matmul(linalg.matmul(root, inside), linalg.transpose(legs))
     part = linalg.matmul(weights[:, None, None] * part, half)
-    rest = linalg.identity(size) - sum_rows(part)
+    rest = linalg.identity(size) - linalg.total(part, 0)
     gains = part + linalg.matmul(rest, first.gains)
     return gains, weights, linalg.congruence(root, inside)
 
@@ -213,22 +213,6 @@ def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
 def _at(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
     """Return the given runs with a contiguous batch axis."""
     return array.take(lanes, axis=-1)
-
-
-def sum_rows(rows: Array) -> Array:
-    """Return the sum over the first axis, in the same order for every number of runs."""
-    total: Array = rows[0].copy()
-    for row in rows[1:]:
-        total += row
-    return total
-
-
-def _total(terms: Array) -> Array:
-    """Return the sum over the second-last axis, in the same order for every number of runs."""
-    if terms.shape[-1] > 1:
-        total: Array = terms.sum(-2)
-        return total
-    return sum_rows(np.moveaxis(terms, -2, 0))  # NumPy sums contiguous axes in pairs
 
 
 def _best_single(
@@ -264,7 +248,7 @@ def _gain(information: Array, spread: Array) -> Array:
     """Return tr(Y_i S Sᵀ) (l, N) of S = P Gᵀ, the negative gradient of the trace of G P Gᵀ."""
     square = linalg.matmul(spread, linalg.transpose(spread))
     product = information * square
-    return _total(product.reshape(len(information), len(square) ** 2, -1))
+    return linalg.total(product.reshape(len(information), len(square) ** 2, -1))
 
 
 def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Array]:
@@ -364,7 +348,7 @@ def _newton(
         trial = _model_minimum(_at(curvature, lanes), _at(gain, lanes), mask)
         free[:, lanes], target[:, lanes] = mask, trial
         lanes = lanes[(trial < 0.0).any(0)]
-    target /= sum_rows(target)
+    target /= linalg.total(target, 0)
     sound = (linalg.dot(target - weights, gain) > 0.0) & (target >= 0.0).all(0)
     unsound = np.flatnonzero(~sound)
     if unsound.size:
@@ -396,7 +380,7 @@ def _curvature(information: Array, root: Array, spread: Array) -> Array:
     scaled = legs + legs
     result = np.zeros((count, count, runs))
     for i in range(count):
-        result[i, i:] = _total(scaled[i] * legs[i:])
+        result[i, i:] = linalg.total(scaled[i] * legs[i:])
     return result
 
 
@@ -418,7 +402,7 @@ def _model_minimum(curvature: Array, gain: Array, free: NDArray[np.bool_]) -> Ar
         if k:
             work[:k, count:] -= work[:k, k, None] * work[k, count:]
     pull, level = work[:, count], work[:, count + 1]
-    excess = (sum_rows(pull) - 1.0) / sum_rows(level)
+    excess = (linalg.total(pull, 0) - 1.0) / linalg.total(level, 0)
     minimum: Array = pull - excess * level
     return minimum
 

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fusion_gym import validation
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Knowledge, Signals
@@ -175,5 +175,4 @@ class Lookahead:
         reward = self._task.reward
         distance = model.fused_means(arriving, self.steps) - best
         weights = reward.error_weight * reward.state_weights
-        total: Array = (weights * (distance * distance).sum(0)).sum(0)
-        return total
+        return linalg.total(weights * linalg.total(distance * distance, 0))

@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import validation
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import ObservationLayout
@@ -180,7 +180,7 @@ class Rollout:
             best = branch.beliefs().best.mean[0]
             spent = branch.deliver(requests).cost
             missed = best - self._task.system.fused(branch.delivered)[0]
-            cost += (self._weights * missed * missed).sum(0) + price * spent
+            cost += linalg.total(self._weights * missed * missed) + price * spent
             if step < self.steps:
                 branch.sense(noise[step].take(lanes, axis=-1))
                 requests = np.asarray(self._decision(branch.signals()))

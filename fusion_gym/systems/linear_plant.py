@@ -133,7 +133,7 @@ class LinearPlant(Plant):
         prior = linalg.congruence(self.transition, covariance) + self.process_covariance
         if not self._known_start:
             return linalg.matvec(self.transition, mean), prior
-        most = (self._cancelling * linalg.diagonal(covariance)[..., None, :, :]).sum(-2)
+        most = linalg.total(self._cancelling * linalg.diagonal(covariance)[..., None, :, :])
         cancelled = linalg.diagonal(prior) < most
         (prior,) = in_runs(cancelled, self._predict_root, (covariance,), (prior,))
         return linalg.matvec(self.transition, mean), prior

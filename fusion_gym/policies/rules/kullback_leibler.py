@@ -69,4 +69,4 @@ def _divergence(estimate: Estimate, silent: Estimate) -> Array:
 
 
 def _log_determinant(covariance: Array) -> Array:
-    return 2.0 * np.log(linalg.diagonal(linalg.cholesky(covariance))).sum(-2)
+    return 2.0 * linalg.total(np.log(linalg.diagonal(linalg.cholesky(covariance))))

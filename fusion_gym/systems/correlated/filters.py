@@ -169,8 +169,8 @@ class JointErrorCovariance:
 
     def fuse(self, joint: Array, weights: Array) -> Array:
         """Return the joint covariance after estimate 0 becomes Σ_j weights_j · estimate j."""
-        row = linalg.matmul(weights[:, None], joint).sum(0)
-        fused = linalg.matmul(row, linalg.transpose(weights)).sum(0)
+        row = linalg.total(linalg.matmul(weights[:, None], joint), 0)
+        fused = linalg.total(linalg.matmul(row, linalg.transpose(weights)), 0)
         result = joint.copy()
         result[0] = row
         result[:, 0] = linalg.transpose(row)

@@ -290,7 +290,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         """Return the reduction (l, N) of the weighted trace by each single measurement."""
         n = self.plant.size
         cross = covariance[:n, n:]
-        squares = (weights[:, None, None] * cross * cross).sum(0)
+        squares = linalg.total(weights[:, None, None] * cross * cross, 0)
         own = linalg.diagonal(covariance)[n:]
         return np.where(useful, squares / np.where(useful, own, 1.0), 0.0)
 

@@ -101,16 +101,16 @@ def mode_mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
     spreads[certain[:, :, None] | certain[:, None]] = 0.0
     if len(means) == 1:
         return means[0], spreads[0]
-    mean = (belief.probability[:, None] * means).sum(0)
+    mean = linalg.total(belief.probability[:, None] * means, 0)
     apart = means - mean
     spreads += linalg.outer(apart, apart)
-    return mean, (belief.probability[:, None, None] * spreads).sum(0)
+    return mean, linalg.total(belief.probability[:, None, None] * spreads, 0)
 
 
 def predict_jointly(belief: Belief, maps: Array, variance: Array) -> ModePrediction:
     """Return the prediction with ``maps`` (M, n + l, s, 1) and noise ``variance`` (M, l, N)."""
     mean, covariance = mode_mixture(belief, maps)
-    own, sensors = (belief.probability[:, None] * variance).sum(0), variance.shape[1]
+    own, sensors = linalg.total(belief.probability[:, None] * variance, 0), variance.shape[1]
     for sensor in range(sensors):
         place = len(mean) - sensors + sensor
         covariance[place, place] += own[sensor]

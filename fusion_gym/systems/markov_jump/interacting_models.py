@@ -111,16 +111,16 @@ class InteractingModels:
         mean, covariance = np.empty_like(moved), np.empty_like(spread)
         for later in modes:
             joint = chain[:, later, None] * belief.probability
-            probability[later] = joint.sum(0)
+            probability[later] = linalg.total(joint)
             possible = probability[later] > 0.0  # else any weights will do
             weights = np.where(possible, joint, 1.0 / self.plant.modes)
             weights /= np.where(possible, probability[later], 1.0)
-            mean[later] = (weights[:, None] * moved).sum(0)
+            mean[later] = linalg.total(weights[:, None] * moved, 0)
             apart = moved - mean[later]
-            covariance[later] = (
-                weights[:, None, None] * (spread + linalg.outer(apart, apart))
-            ).sum(0)
-        probability /= probability.sum(0)
+            covariance[later] = linalg.total(
+                weights[:, None, None] * (spread + linalg.outer(apart, apart)), 0
+            )
+        probability /= linalg.total(probability)
         return with_noise(probability, mean, covariance, self.plant.noise_covariance)
 
     def prediction(self, belief: Belief, time: Times) -> ModePrediction:
@@ -138,7 +138,7 @@ class InteractingModels:
         # The likeliest possible model has weight one, so that far tails do not make 0 / 0.
         possible = np.where(belief.probability > 0.0, likelihood, -np.inf)
         weights = belief.probability * np.exp(possible - possible.max(0))
-        return after._replace(probability=weights / weights.sum(0))
+        return after._replace(probability=weights / linalg.total(weights))
 
     def estimate(self, belief: Belief) -> tuple[Array, Array]:
         """Return mean (n, N) and covariance (n, n, N) of the plant's state, over all modes."""

@@ -254,7 +254,7 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
             "channel_state": state.channel,
             "prior_mean": state.prior,
             "prior_covariance": lambda: _diagonal(state.prior_variance),
-            "silent_variance": lambda: self._weighted(self._silent(state)[1]).sum(0),
+            "silent_variance": lambda: linalg.total(self._weighted(self._silent(state)[1])),
             "variance_reduction": lambda: (
                 self._weighted(self._silent(state)[1]) * self._arrival_probability(state.channel)
             ),

@@ -205,7 +205,7 @@ class FeedbackCentre(NodeCentre):
         expectation = self.filter.expect(mean)
         root = linalg.root(self.sensors.regular(covariance))
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
-        deviation = _deviation(self.sensors, expectation, (observed * observed).sum(-2))
+        deviation = _deviation(self.sensors, expectation, linalg.total(observed * observed))
         share = self.feedback.share[:, None, None]
         inflated = observed / namespace(share).sqrt(share)
         outcomes = self.filter.outcomes(inflated, expectation, held, time)
@@ -277,7 +277,7 @@ class FederatedCentre(NodeCentre):
         sensors, weight = self.sensors, self.filter.silence
         expectation, root = self.filter.expect(mean), linalg.root(covariance)
         observed = linalg.matmul(sensors.measurement_matrix, root)
-        deviation = _deviation(sensors, expectation, (observed * observed).sum(-2))
+        deviation = _deviation(sensors, expectation, linalg.total(observed * observed))
         if weight is not None:
             # Both sides times √Z, so that weight 0 is no exception.
             scale = ((weight / (1.0 + weight * sensors.variance[..., 0])) ** 0.5)[..., None, None]

@@ -169,12 +169,12 @@ def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
     xp = namespace(matrix, value)
     both = xp.concatenate([matrix, value[..., None, :]], axis=-2)
     if size < _LARGE:
-        total = (matrix[..., :, None, :] * both[..., None, :, :]).sum(-4)
+        total = linalg.total(matrix[..., :, None, :] * both[..., None, :, :], -4)
     else:
         total = linalg.matmul(linalg.transpose(matrix), both)
     covariance = linalg.inverse(linalg.identity(size) + total[..., :size, :])
     mean = linalg.matvec(covariance, total[..., size, :])
-    large = (matrix * matrix).sum(-2) > _STARVED
+    large = linalg.total(matrix * matrix) > _STARVED
     results = in_runs(large, _sequential_update, (matrix, value), (mean, covariance))
     return results[0], results[1]
 

@@ -110,7 +110,7 @@ class HoldCentre(Centre):
     def _predict(self, prior: Gaussian, held: Array, moment: Array) -> CentrePrediction:
         expectation, root = self.filter.expect(prior[0]), linalg.root(prior[1])
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
-        spread = (observed * observed).sum(-2) + self.sensors.variance
+        spread = linalg.total(observed * observed) + self.sensors.variance
         return CentrePrediction(expectation, np.sqrt(spread), root, held=held, moment=moment)
 
     def _delivered(self, moment: Array, granted: Packets) -> Array:

@@ -161,7 +161,7 @@ class AssumedDensityFilter:
         matrix = self.sensors.measurement_matrix
         latent = linalg.matvec(matrix, mean)
         xp = namespace(mean)
-        spread = xp.square(linalg.matmul(matrix, root)).sum(-2) + self.sensors.variance
+        spread = linalg.total(xp.square(linalg.matmul(matrix, root))) + self.sensors.variance
         return censored_moments(self.sensors, latent, xp.sqrt(spread))
 
     def update(

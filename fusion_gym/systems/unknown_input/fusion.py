@@ -20,7 +20,6 @@ from fusion_gym.fusion.several import (
     CovarianceIntersection,
     covariance_intersection_many,
     is_regular,
-    sum_rows,
 )
 
 _GAP = 0.01  # relative gap at which the tracked weights rest
@@ -101,8 +100,8 @@ def _smallest_variance(mean: Array, covariance: Array) -> Fused:
     """Return the covariance intersection of scalars: the smallest variance, or equal shares."""
     smallest = covariance.min(0)
     selection = (covariance == smallest)[:, 0, 0]
-    weights = selection / selection.sum(0)
-    joined = (weights[:, None] * mean).sum(0)
+    weights = selection / linalg.total(selection * 1.0)
+    joined = linalg.total(weights[:, None] * mean, 0)
     return Fused(joined, smallest, lambda: weights[:, None, None], weights)
 
 
@@ -128,27 +127,27 @@ def tracked_intersection(
     nodes, n = mean.shape[:2]
     vectors = linalg.matvec(information, mean)
     weights = np.maximum(weights, _FLOOR)
-    weights /= sum_rows(weights)
+    weights /= linalg.total(weights, 0)
     lanes: slice | np.ndarray = slice(None)
     fused = np.empty(covariance.shape[1:])
     for step in range(_STEPS):
         part, some = information[..., lanes], weights[:, lanes]
-        bound = linalg.inverse(sum_rows(some[:, None, None] * part))
+        bound = linalg.inverse(linalg.total(some[:, None, None] * part, 0))
         fused[..., lanes] = bound
         if step == _STEPS - 1:
             break
         metric = None if basis is None else basis[..., lanes]
         spread = bound if metric is None else linalg.matmul(bound, linalg.transpose(metric))
         square = linalg.matmul(spread, linalg.transpose(spread))
-        gain = sum_rows((part * square).reshape(nodes, n * n, -1).swapaxes(0, 1))
+        gain = linalg.total((part * square).reshape(nodes, n * n, -1))
         total = linalg.trace(bound if metric is None else linalg.matmul(metric, spread))
         still = gain.max(0) > (1.0 + _GAP) * total
         if not still.any():
             break
         lanes = np.flatnonzero(still) if isinstance(lanes, slice) else lanes[still]
         moved = np.maximum(some[:, still] * np.sqrt(gain[:, still]), _FLOOR**2)
-        weights[:, lanes] = moved / sum_rows(moved)
-    joined = linalg.matvec(fused, sum_rows(weights[:, None] * vectors))
+        weights[:, lanes] = moved / linalg.total(moved, 0)
+    joined = linalg.matvec(fused, linalg.total(weights[:, None] * vectors, 0))
     lanes = np.flatnonzero(~is_regular(covariance, information).all(0))
     if lanes.size:
         own = None if basis is None else basis[..., lanes]

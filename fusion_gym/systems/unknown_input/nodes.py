@@ -173,7 +173,7 @@ class TableNodes(Nodes):
         n = self.model.size
         state = linalg.matvec(self._at(self.state_gain, time), mean[:, :n])
         inputs = linalg.matvec(self._at(self.input_gain, time), mean[:, n:])
-        fused = np.concatenate((state.sum(0), inputs.sum(0)))
+        fused = np.concatenate((linalg.total(state, 0), linalg.total(inputs, 0)))
         return Estimates(mean, fused, None, None, None)
 
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
