@@ -34,7 +34,7 @@ from fusion_gym.evaluation.envelope import (
     compare_with_envelope,
     lower_envelope,
 )
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults, run_several
 from fusion_gym.output import figures, tables
 from fusion_gym.output.files import write
 from fusion_gym.output.progress import progress_bar, writing
@@ -104,14 +104,10 @@ def run_all(
     task: Task, policies: list[str], episodes: int, seed: int, description: str
 ) -> dict[str, EpisodeResults]:
     """Run every policy on the same seeds, with a progress bar."""
-    built = {name: make_policy(name, task) for name in policies}
-    total = len(policies) * episodes * task.horizon
-    with progress_bar(total, description) as bar:
-        result = {}
-        for name, policy in built.items():
-            bar.say(name)
-            result[name] = run_episodes(task, policy, episodes, seed, bar.update)
-        return result
+    built = [make_policy(name, task) for name in policies]
+    with progress_bar(len(policies) * episodes * task.horizon, description) as bar:
+        results = run_several(task, built, episodes, seed, bar.update)
+    return dict(zip(policies, results, strict=True))
 
 
 def compare(

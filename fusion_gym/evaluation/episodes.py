@@ -1,8 +1,9 @@
 """Run a policy over episodes whose noise is fixed by their seeds."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.evaluation.policy_batch import Together, seeded
 from fusion_gym.fusion.intersection import orthonormalise
 from fusion_gym.policies.base import Policy, decide, owner_of
 
+_EPISODE_MEANS = ("mse", "error_cost", "bound_trace", "nees", "tokens", "denied", "diverged")
 BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on the machine
 
 
@@ -96,17 +99,51 @@ def run_episodes(
         >>> round(float(results.rate.mean()), 2)
         0.25
     """
+    return run_several(task, [policy], episodes, seed, progress)[0]
+
+
+def run_several(
+    task: Task,
+    policies: Sequence[Policy],
+    episodes: int,
+    seed: int,
+    progress: Callable[[int], Any] | None = None,
+) -> list[EpisodeResults]:
+    """Run policies as :func:`run_episodes` does, those with one owner of beliefs in one batch.
+
+    Args:
+        task: the task.
+        policies: the policies.
+        episodes: number of episodes of each policy, >= 1.
+        seed: seed of the first episode, >= 0.
+        progress: function that receives the number of environment steps since its last call.
+
+    Raises:
+        ConfigurationError: fewer than one episode, or a negative seed.
+        LookupError: a policy uses a signal that the task withholds.
+    """
     validation.integer("episodes", episodes, at_least=1)
     validation.integer("seed", seed, at_least=0)
     windows = getattr(task.noise, "count", episodes)
     if episodes > windows:
         text = f"episodes = {episodes}: the recording has {windows} windows, which repeat"
-        warnings.warn(text, stacklevel=2)
-    parts = [
-        _run_batch(task, policy, min(BATCH, episodes - first), seed + first, progress)
-        for first in range(0, episodes, BATCH)
-    ]
-    weights = np.array([part.episodes for part in parts]) / episodes
+        warnings.warn(text, stacklevel=3)
+    results: list[EpisodeResults] = []
+    for _, same in groupby(policies, owner_of):
+        group, size = list(same), max(1, BATCH // episodes)
+        for some in (group[place : place + size] for place in range(0, len(group), size)):
+            parts = [
+                _run_batch(task, some, min(BATCH, episodes - first), seed + first, progress)
+                for first in range(0, episodes, BATCH)
+            ]
+            results += map(_joined, zip(*parts, strict=True))
+    return results
+
+
+def _joined(parts: Sequence[EpisodeResults]) -> EpisodeResults:
+    """Return the results of all episodes of a policy."""
+    weights = np.array([part.episodes for part in parts])
+    weights = weights / weights.sum()
     joined = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in fields(EpisodeResults)
@@ -138,44 +175,47 @@ def _counted(task: Task, state: Any, error: Array, covariance: Array) -> tuple[A
 
 
 def _run_batch(
-    task: Task, policy: Policy, episodes: int, seed: int, progress: Callable[[int], Any] | None
-) -> EpisodeResults:
-    batch = EpisodeBatch.seeded(task, episodes, seed, owner_of(policy))
-    states, sensors, horizon = len(task.system.state_names), task.sensors, task.horizon
-    mse, trace, nees = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
-    tokens, denied, returns = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
-    rate, requests = np.zeros((sensors, episodes)), np.zeros((sensors, episodes))
-    diverged, error_cost = np.zeros(episodes), np.zeros(episodes)
-    squared_error = np.empty((horizon, states))
-    for step, request in enumerate(decide(policy, batch, seed)):
+    task: Task,
+    policies: Sequence[Policy],
+    episodes: int,
+    seed: int,
+    progress: Callable[[int], Any] | None,
+) -> list[EpisodeResults]:
+    """Return the results of policies with one owner of beliefs, all in one batch."""
+    runs = len(policies) * episodes
+    batch = seeded(task, owner_of(policies[0]), seed + np.arange(runs) % episodes)
+    policy = policies[0] if len(policies) == 1 else Together(task, policies)
+    horizon, sensors = task.horizon, task.sensors
+    means = {name: np.zeros(runs) for name in _EPISODE_MEANS}
+    rate, requests = np.zeros((sensors, runs)), np.zeros((sensors, runs))
+    returns, squared_error = np.zeros(runs), []
+    for request in decide(policy, batch, seed):
         outcome = batch.step(request)
         covariance = task.system.fused(batch.delivered)[1]
-        squared_error[step] = outcome.squared_error.mean(-1)
-        mse += outcome.squared_error.sum(0)
-        trace += linalg.trace(covariance)
-        nees += _normalised_error(*_counted(task, batch.delivered, outcome.error, covariance))
+        squared_error.append(outcome.squared_error.reshape(-1, len(policies), episodes).mean(-1))
+        means["mse"] += outcome.squared_error.sum(0)
+        means["bound_trace"] += linalg.trace(covariance)
+        counted = _counted(task, batch.delivered, outcome.error, covariance)
+        means["nees"] += _normalised_error(*counted)
+        means["tokens"] += outcome.cost
+        means["denied"] += (outcome.requested & ~outcome.granted).sum(0)
+        means["error_cost"] -= outcome.reward_error
+        means["diverged"] += outcome.diverged
         rate += outcome.granted
         requests += outcome.requested
-        tokens += outcome.cost
-        denied += (outcome.requested & ~outcome.granted).sum(0)
         returns += outcome.reward
-        error_cost -= outcome.reward_error
-        diverged += outcome.diverged
         if progress is not None:
-            progress(episodes)
-    return EpisodeResults(
-        mse=mse / horizon,
-        error_cost=error_cost / horizon,
-        bound_trace=trace / horizon,
-        nees=nees / horizon,
-        rate=(rate / horizon).T,
-        requests=(requests / horizon).T,
-        tokens=tokens / horizon,
-        denied=denied / horizon,
-        returns=returns,
-        diverged=diverged / horizon,
-        squared_error=squared_error,
-    )
+            progress(runs)
+    values = {name: total / horizon for name, total in means.items()}
+    values |= {"rate": (rate / horizon).T, "requests": (requests / horizon).T, "returns": returns}
+    paths = np.moveaxis(np.array(squared_error), -1, 0)
+    return [
+        EpisodeResults(
+            **{name: value[first : first + episodes] for name, value in values.items()},
+            squared_error=path,
+        )
+        for first, path in zip(range(0, runs, episodes), paths, strict=True)
+    ]
 
 
 @dataclass(frozen=True)

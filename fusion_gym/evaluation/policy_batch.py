@@ -68,8 +68,8 @@ def run_policies(
             "together: there must be policies, and all must have the same owner"
         )
     runs = len(policies) * episodes
-    batch = _batch(task, owners.pop(), seed + np.arange(runs) % episodes)
-    together = _Together(task, policies)
+    batch = seeded(task, owners.pop(), seed + np.arange(runs) % episodes)
+    together = Together(task, policies)
     brief = _run(batch, together, seed)
     return [EpisodeMeans(*(values[part] for values in brief)) for part in together.parts]
 
@@ -88,12 +88,13 @@ def run_priced(task: Task, policy: Policy, seeds: Runs, prices: Array) -> Episod
     Raises:
         LookupError: the policy uses a signal that the task withholds.
     """
-    batch = _batch(task, owner_of(policy), seeds)
+    batch = seeded(task, owner_of(policy), seeds)
     batch.price = np.array(prices, dtype=np.float64)
     return _run(batch, policy, int(seeds[0]))
 
 
-def _batch(task: Task, owner: Owner | None, seeds: Runs) -> EpisodeBatch:
+def seeded(task: Task, owner: Owner | None, seeds: Runs) -> EpisodeBatch:
+    """Return runs with these seeds (N,), at the start of an episode."""
     batch = EpisodeBatch(task, len(seeds), owner)
     batch.seed(np.arange(len(seeds)), seeds.tolist())
     batch.reset()
@@ -112,7 +113,7 @@ def _run(batch: EpisodeBatch, policy: Policy, seed: int) -> EpisodeMeans:
     return EpisodeMeans(*(sums / batch.task.horizon))
 
 
-class _Together:
+class Together:
     """Several policies as one, each with an equal part of the runs."""
 
     knowledge: Knowledge = KNOWLEDGE[-1]
