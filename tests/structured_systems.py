@@ -362,6 +362,7 @@ class Survey:
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message=".*rounding errors may reach")
+                warnings.filterwarnings("ignore", message=".*no sensor measures it")
                 task = make_task(drawn.env_id, **drawn.options)
         except ConfigurationError as error:
             self.refused[reason(str(error))] += 1

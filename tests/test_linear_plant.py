@@ -1,10 +1,12 @@
 """The plant: its noise, its factors, its closed forms and what it refuses."""
 
+import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 
+import fusion_gym
 from fusion_gym import ConfigurationError
 from fusion_gym.systems.linear_plant import LinearPlant, covariance_factor
 
@@ -141,3 +143,27 @@ def test_bad_matrices_are_refused(change: dict[str, Any], field: str, reason: st
     assert message.startswith(f"{field} = ")
     assert " is not allowed: it must be " in message
     assert reason in message
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3])
+@pytest.mark.parametrize(("pole", "seen"), [(1.2, 0.0), (1.2, 1e-3), (0.99, 0.0), (1.0, 0.0)])
+def test_a_growing_state_that_nobody_measures_gets_a_warning(
+    pole: float, seen: float, angle: float
+) -> None:
+    """Also as a direction across states, in units far apart."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = np.diag([1.0, 1e6]) @ turn
+    back = np.linalg.inv(turn)
+    options = {
+        "transition": turn @ np.diag([0.9, pole]) @ back,
+        "process_covariance": turn @ turn.T,
+        "measurement_matrices": [[1.0, seen] @ back],
+        "reward_scale": None,
+    }
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        fusion_gym.make_task("fusion_gym/LinearFusion-v2", horizon=30, **options)
+    messages = [str(item.message) for item in warned if "no sensor measures" in str(item.message)]
+    assert bool(messages) == (pole > 1.0 and seen == 0.0)
+    assert all("grows by 1.2 a step" in message for message in messages)
+    assert angle or all("'x2'" in message for message in messages)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
 from fusion_gym.namespace import in_runs
 
+_SEEN, _NOTHING = 1e-9, 1e-300  # relative rounding of a rank, and the least length
 _CANCELLED = 1e-3  # of what is summed; what is left has lost three digits
 
 
@@ -54,6 +56,22 @@ class Plant:
         still = np.eye(self.size)
         moved = still + factor * (self.transition[..., 0] - still)
         return float(np.abs(np.linalg.eigvals(moved)).max())
+
+    def warn_of_unseen_growth(self, rows: Array, names: Sequence[str]) -> None:
+        """Warn of a growing state that no row (…, n, 1) of a sensor measures, by Hautus' test."""
+        transition, rows = self.transition[..., 0], rows.reshape(-1, self.size)
+        for value in np.linalg.eigvals(transition):
+            pencil = np.concatenate([transition - value * np.eye(self.size), rows])
+            length = np.maximum(np.linalg.norm(pencil, axis=0), _NOTHING)
+            _, share, basis = np.linalg.svd(pencil / length)
+            if abs(value) > 1.0 + _SEEN and share[-1] <= _SEEN * share[0]:
+                state = names[int(np.abs(basis[-1]).argmax())]
+                warnings.warn(
+                    f"the state {state!r} grows by {abs(value):.4g} a step, and no sensor measures "
+                    "it: no transmission lowers its error",
+                    stacklevel=2,
+                )
+                return
 
     @property
     def unmoved(self) -> tuple[str, ...]:

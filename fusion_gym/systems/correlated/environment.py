@@ -113,6 +113,7 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     weights = equal_weights(open_loop) if chosen is None else chosen
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
+    plant.warn_of_unseen_growth(sensors.measurement_matrix, _state_names(plant.size))
     if options.track_actual:
         nature.refuse("with track_actual=True")
     system = CorrelatedTrackingSystem(

@@ -123,6 +123,7 @@ def make_system(
     absent = ("true_threshold_shift",) if centre.sensors.unlimited else ()
     nature = Nature.create(options, (*plant.unmoved, *absent))
     nature.check_growth(plant.true_radius, options.horizon)
+    plant.warn_of_unseen_growth(centre.sensors.stacked_matrix, state_names)
     return CensoredSystem(
         plant=plant,
         model=plant if model is None else model,
