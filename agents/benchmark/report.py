@@ -214,6 +214,12 @@ def draw_class(panel: Axes, rows: Sequence[TestRow]) -> None:
                 marker=marker, markersize=5, linewidth=1, label=label if seed == 0 else None,
             )  # fmt: skip
     panel.set(xscale="log", yscale="log", xlabel="tokens a step")
+    if any(row.tokens == 0.0 for row in rows):  # at a tick of its own, left of the others
+        least = min(row.tokens for row in rows if row.tokens > 0.0)
+        panel.set_xscale("symlog", linthresh=least, linscale=0.3)
+        ends = -0.2 * least, panel.get_xlim()[1]
+        decades = 10.0 ** np.arange(np.ceil(np.log10(least)), np.log10(ends[1]))
+        panel.set(xticks=[0.0, *decades], xlim=ends)
     panel.xaxis.set_minor_formatter("")
 
 
