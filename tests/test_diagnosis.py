@@ -1,6 +1,8 @@
 """What a training shows of itself: the lines of TensorBoard, and validation at each price."""
 
+import json
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.diagnosis import by_price, prices_of
+from fusion_gym.training.diagnosis import PriceRecord, threshold_costs, warn_of_silence
 from fusion_gym.training.run import train
 
 FRONT = {"filter": "tobit", "horizon": 20, "cost_weight": "random", "price_range": [0.01, 0.32]}
@@ -64,39 +66,51 @@ def test_traffic_entropy_and_validation_at_each_price_are_shown(
     if kind == "counterfactual_ppo":
         for name in ("advantage_spread", "surplus_share", "explained_variance"):
             assert visible[f"train/{name}"]
-    for part in read_records(tmp_path / "run")[-1]["prices"]:
-        where = f"price_{part['low']:.3g}-{part['high']:.3g}"
-        for key in ("mse", "rate"):
-            assert visible[f"validation/{key}_{where}"][-1] == pytest.approx(part[key])
+    for row in read_records(tmp_path / "run")[-1]["prices"]:
+        for key in ("cost", "tokens", "mse", "drawn_cost", "drawn_tokens", "drawn_mse"):
+            name = f"validation/{key}_price_{row['price']:.3g}"
+            assert visible[name][-1] == pytest.approx(row[key])
 
 
-def test_the_records_at_each_price_are_those_of_the_whole(tmp_path: Path) -> None:
+def test_the_records_at_each_price_are_those_of_the_agent(tmp_path: Path) -> None:
+    """Of the likeliest action; drawn actions of a new agent send about half of the time."""
     trained(tmp_path, "ppo")
-    for record in read_records(tmp_path / "run"):
-        parts = record["prices"]
-        assert [round(part["low"], 6) for part in parts] == [0.01, 0.02, 0.04, 0.08, 0.16]
-        assert sum(part["episodes"] for part in parts) == 40
-        for key in ("mse", "rate"):
-            mean = sum(part["episodes"] * part[key] for part in parts) / 40
-            assert mean == pytest.approx(record[key])
-
-
-def test_episodes_are_reported_apart_by_their_price() -> None:
-    """Against each episode by itself, with a rule that asks for less at higher prices."""
+    record, options = read_records(tmp_path / "run")[-1], FRONT | {"price_range": None}
+    prices = [row["price"] for row in record["prices"]]
+    np.testing.assert_allclose(prices, np.geomspace(0.01, 0.32, 5))
+    for row in record["prices"]:
+        task = make_task(ENV, **options | {"cost_weight": row["price"]})
+        agent = f"model:{tmp_path / 'run' / 'final_model.zip'},price={row['price']!r}"
+        results = run_episodes(task, make_policy(agent, task), 8, 500_000_000)
+        assert row["mse"] == pytest.approx(results.mse.mean())
+        assert row["tokens"] == pytest.approx(results.tokens.mean())
+        assert row["cost"] == pytest.approx(-results.returns.mean() / task.horizon)
+        assert row["drawn_tokens"] > 0.0 != row["drawn_mse"]
+    costs = np.array([row["cost"] for row in record["prices"]])
     task = make_task(ENV, **FRONT)
-    prices = prices_of(task, 30, 7)
-    results = run_episodes(task, make_policy("random:rate=0.3", task), 30, 7)
-    for part in by_price(task, prices, results):
-        inside = [i for i, price in enumerate(prices) if part["low"] <= price < part["high"]]
-        assert part["episodes"] == len(inside)
-        assert part["mse"] == pytest.approx(float(np.mean(results.mse[inside])))
-        assert part["rate"] == pytest.approx(float(np.mean(results.rate[inside])))
-    assert {round(float(price), 12) for price in prices} == {
-        round(float(prices_of(task, 1, 7 + i)[0]), 12) for i in range(30)
-    }
+    relative = costs / threshold_costs(task, False, prices)
+    assert record["relative_cost"] == pytest.approx(relative.mean())
 
 
-def test_a_fixed_price_has_no_parts(tmp_path: Path) -> None:
+def test_the_best_model_has_the_least_relative_cost(tmp_path: Path) -> None:
+    trained(tmp_path, "ppo")
+    records = read_records(tmp_path / "run")
+    least = min(record["relative_cost"] for record in records)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["best_validation"]["relative_cost"] == least
+
+
+@pytest.mark.parametrize(("tokens", "expected"), [(0.0, True), (0.6, False)])
+def test_a_silent_likeliest_action_gets_a_warning(tokens: float, expected: bool) -> None:
+    row = PriceRecord(0.1, 1.0, tokens, 1.0, 0.1, 1.0, 1.0, 1.0)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        warn_of_silence([row, row._replace(tokens=1.0)])
+    assert [bool("at 1 of 2 prices" in str(item.message)) for item in warned] == [True] * expected
+
+
+def test_a_fixed_price_is_the_one_of_the_records(tmp_path: Path) -> None:
     trained(tmp_path, "ppo", cost_weight=0.02)
-    assert all("prices" not in record for record in read_records(tmp_path / "run"))
-    assert not [name for name in lines(tmp_path / "run") if "price_" in name]
+    for record in read_records(tmp_path / "run"):
+        assert [row["price"] for row in record["prices"]] == [0.02]
+        assert record["relative_cost"] == record["prices"][0]["cost"]

@@ -134,7 +134,7 @@ def compare(
     console.print(tables.evaluation_table(title, reports, report["quantiles"], {}))
     console.print(price_table(points, baselines))
     console.print(rate_table(points))
-    warn_of_unused_tokens(task, next(iter(learned.values())))
+    warn_of_unused_tokens(task, float(next(iter(learned.values())).tokens.mean()))
     lines = [
         figures.FigureLine(curve.label, [baselines[name] for name in rules])
         for curve in sweep.curves

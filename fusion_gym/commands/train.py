@@ -4,8 +4,8 @@
     fusion-gym train --env fusion_gym/LinearFusion-v2 --algorithm ppo --timesteps 200000
 
 The config's ``output`` folder receives ``config.yaml``, ``latest.zip`` (the checkpoint),
-``best_model.zip`` (best return on the validation seeds), ``validation.jsonl`` and ``tensorboard/``,
-and at the end ``final_model.zip`` and ``summary.json``.
+``best_model.zip`` (the least validation cost relative to single thresholds),
+``validation.jsonl`` and ``tensorboard/``, and at the end ``final_model.zip`` and ``summary.json``.
 
 The command writes a checkpoint after every validation. Ctrl-C and SIGTERM end the training after
 the current rollout with a checkpoint; a second Ctrl-C ends it at once, without one. ``--resume``

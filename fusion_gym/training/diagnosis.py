@@ -4,18 +4,22 @@
 """
 
 import warnings
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.scale import sustained_tokens
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import EpisodeResults
+from fusion_gym.evaluation.policy_batch import run_priced
+from fusion_gym.evaluation.rule_search import ClassName, search_of_class
+from fusion_gym.policies.card import ModelView
+from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.training.callback import Callback
 
-PARTS = 5  # of the range of prices, equal on a logarithmic scale
+PRICES = 5  # of a validation over a range, evenly spaced on a logarithmic scale
 
 
 class Traffic(Callback):
@@ -42,38 +46,71 @@ class Traffic(Callback):
             self.logger.record_mean("rollout/granted", (env.requests[1] - granted) / chances)
 
 
-def prices_of(task: Task, episodes: int, seed: int) -> Array:
-    """Return the prices (E,) of a token in the episodes of these seeds."""
-    fixed = task.reward.price.fixed
-    if fixed is not None:
-        return np.full(episodes, fixed)
-    return EpisodeBatch.seeded(task, episodes, seed).price
+class PriceRecord(NamedTuple):
+    """An agent at a price of a token: means per step of its likeliest and of drawn actions."""
+
+    price: float
+    cost: float
+    tokens: float
+    mse: float
+    rate: float
+    drawn_cost: float
+    drawn_tokens: float
+    drawn_mse: float
 
 
-def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[str, Any]]:
-    """Return rate and MSE of the episodes in each non-empty part of the range of prices."""
-    span = task.reward.price.span
-    if task.reward.price.fixed is not None or span is None:
-        return []
-    ends = np.geomspace(*span, PARTS + 1)
-    part = np.clip(np.searchsorted(ends, prices, side="right") - 1, 0, PARTS - 1)
-    return [
-        {
-            "low": float(ends[place]),
-            "high": float(ends[place + 1]),
-            "episodes": int(selection.sum()),
-            "rate": float(results.rate[selection].mean()),
-            "mse": float(results.mse[selection].mean()),
-        }
-        for place in range(PARTS)
-        if (selection := part == place).any()
-    ]
+def validation_prices(task: Task) -> tuple[float, ...]:
+    """Return the prices of a validation: of a drawn price the range, else the task's own."""
+    price = task.reward.price
+    if price.fixed is not None or price.span is None:
+        return tuple(price.draw(np.array([0.5])).tolist())
+    return tuple(np.geomspace(*price.span, PRICES).tolist())
 
 
-def warn_of_unused_tokens(task: Task, results: EpisodeResults) -> None:
-    """Warn if an agent spends less than half of its tokens at its lowest price."""
+def run_at_prices(
+    model: BaseAlgorithm, task: Task, local: bool, prices: Sequence[float], episodes: int, seed: int
+) -> list[PriceRecord]:
+    """Run the model's likeliest and drawn actions at each price, on the same episodes."""
+    count = max(1, episodes // len(prices))
+    each, seeds = np.repeat(prices, count), seed + np.tile(np.arange(count), len(prices))
+    columns: list[Array] = [np.array(prices)]
+    for deterministic in (True, False):
+        policy = ModelPolicy(model, task, deterministic, trained=ModelView(local=local))
+        means = run_priced(task, policy, seeds, each)
+        columns += [means.cost(each), means.tokens, means.mse]
+        columns += [means.rate] if deterministic else []
+    rows = zip(
+        *(column.reshape(len(prices), -1).mean(1).tolist() for column in columns), strict=True
+    )
+    return [PriceRecord(*row) for row in rows]
+
+
+def threshold_costs(task: Task, local: bool, prices: Sequence[float]) -> Array:
+    """Return the cost of the best single threshold of the class at each price; 1 at one price."""
+    if len(prices) == 1:
+        return np.ones(1)
+    name: ClassName = "centre" if task.information == "centre" else "scheduler"
+    search = search_of_class("local" if local else name, task, prices, episodes=(16, 16))
+    return search.start_costs(search.start)
+
+
+def warn_of_silence(records: Sequence[PriceRecord]) -> None:
+    """Warn where the likeliest action spends less than half of the tokens of drawn actions."""
+    silent = [row for row in records if row.tokens < 0.5 * row.drawn_tokens]
+    if silent:
+        row = min(silent, key=lambda row: row.tokens / row.drawn_tokens)
+        warnings.warn(
+            f"at {len(silent)} of {len(records)} prices the likeliest action spends less than half "
+            f"of the tokens of drawn actions (at {row.price:.4g}: {row.tokens:.3g} of "
+            f"{row.drawn_tokens:.3g} a step): fusion-gym calibrate mends it",
+            stacklevel=2,
+        )
+
+
+def warn_of_unused_tokens(task: Task, tokens: float) -> None:
+    """Warn if an agent at its lowest price spends less than half of the sustained tokens a step."""
     sustained = sustained_tokens(task)
-    share = float(results.tokens.mean()) / sustained if sustained else 1.0
+    share = tokens / sustained if sustained else 1.0
     if share < 0.5 and not task.bucket.unlimited:
         warnings.warn(
             f"at its lowest price the agent spends {share:.0%} of the tokens that the bucket "

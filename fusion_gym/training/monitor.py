@@ -16,16 +16,18 @@ import numpy as np
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.progress import Bar
-from fusion_gym.policies.card import ModelView
-from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.training import checkpoint
 from fusion_gym.training.callback import Callback
 from fusion_gym.training.checkpoint import Journal
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.diagnosis import by_price, prices_of
+from fusion_gym.training.diagnosis import (
+    PriceRecord,
+    run_at_prices,
+    threshold_costs,
+    validation_prices,
+)
 
 
 class Interrupt:
@@ -73,7 +75,7 @@ class Progress(Callback):
         super().__init__()
         self.experiment, self.folder, self.task = experiment, folder, task
         self.interrupt, self.bar, self.journal = interrupt, bar, journal
-        self.best = max((record["return"] for record in journal.records), default=-np.inf)
+        self.best = min((record["relative_cost"] for record in journal.records), default=np.inf)
         self._mark = _now()
         self._env_mark = 0.0
         self._next = 0
@@ -136,44 +138,49 @@ class Progress(Callback):
             self._measure("validation")
 
     def validate(self) -> None:
-        """Run the validation episodes, log them, and save the model if it is the best so far."""
-        results = self._run()
+        """Run the validation episodes, log them, and save the model if it is the best so far.
+
+        The best has the least mean over the prices of its cost relative to a single threshold's.
+        """
+        settings, local = self.experiment.validation, self.experiment.environment.local
+        rows = run_at_prices(
+            self.model, self.task, local, self.prices, settings.episodes, settings.seed
+        )
+        means = PriceRecord(*np.mean(rows, axis=0).tolist())
+        costs = np.array([row.cost for row in rows])
+        scale = self.task.reward.price.scale(
+            np.array(self.prices), self.experiment.training.price_exponent
+        )
         record: dict[str, Any] = {
             "timesteps": self.num_timesteps,
-            "return": float((results.returns * self._weights()).mean()),
-            "mse": float(results.mse.mean()),
-            "rate": float(results.rate.mean()),
+            "return": -self.task.horizon * float((scale * costs).mean()),
+            "mse": means.mse,
+            "rate": means.rate,
+            "relative_cost": float((costs / self.references).mean()),
+            "prices": [row._asdict() for row in rows],
         }
-        parts = by_price(self.task, self.prices, results)
-        if parts:
-            record["prices"] = parts
-        if record["return"] > self.best:
-            self.best = record["return"]
+        if record["relative_cost"] < self.best:
+            self.best = record["relative_cost"]
             file = io.BytesIO()
             self.model.save(file)
             self.journal.best = file.getvalue()
             self._write_best(self.journal.best)
         self.journal.records.append(record)
         self._write_records()
-        for key in ("return", "mse", "rate"):
+        for key in ("return", "mse", "rate", "relative_cost"):
             self.logger.record(f"validation/{key}", record[key])
         self.logger.record("validation/cpu_seconds", self.journal.cpu_seconds)
-        for part in parts:
-            where = f"price_{part['low']:.3g}-{part['high']:.3g}"
-            for key in ("mse", "rate"):
-                self.logger.record(f"validation/{key}_{where}", part[key])
+        for row in rows:
+            for key, value in row._asdict().items():
+                if key != "price":
+                    self.logger.record(f"validation/{key}_price_{row.price:.3g}", value)
         self.logger.dump(self.num_timesteps)
         self.bar.say(log_line(record))
 
-    def run_cheapest(self) -> EpisodeResults:
-        """Return the validation episodes of the model at its lowest price."""
-        span = self.task.reward.price.span
-        return self._run(None if span is None else span[0])
-
-    def _run(self, price: float | None = None) -> EpisodeResults:
-        settings, local = self.experiment.validation, self.experiment.environment.local
-        policy = ModelPolicy(self.model, self.task, price=price, trained=ModelView(local=local))
-        return run_episodes(self.task, policy, settings.episodes, settings.seed)
+    @property
+    def last(self) -> list[PriceRecord]:
+        """The last validation."""
+        return [PriceRecord(**row) for row in self.journal.records[-1]["prices"]]
 
     def _write_best(self, content: bytes) -> None:
         with replacing(self.folder / "best_model.zip") as partial:
@@ -184,17 +191,14 @@ class Progress(Callback):
         write_text(self.folder / "validation.jsonl", "".join(lines))
 
     @functools.cached_property
-    def prices(self) -> Array:
-        """The price of a token in each validation episode."""
-        settings = self.experiment.validation
-        return prices_of(self.task, settings.episodes, settings.seed)
+    def prices(self) -> tuple[float, ...]:
+        """The prices of a token in validations."""
+        return validation_prices(self.task)
 
-    def _weights(self) -> Array:
-        """Return the weight of each validation episode's return, by its price."""
-        exponent = self.experiment.training.price_exponent
-        if exponent == 0.0:
-            return np.ones(1)
-        return self.task.reward.price.scale(self.prices, exponent)
+    @functools.cached_property
+    def references(self) -> Array:
+        """The cost of the best single threshold at each price."""
+        return threshold_costs(self.task, self.experiment.environment.local, self.prices)
 
     def save(self) -> None:
         """Write the checkpoint."""

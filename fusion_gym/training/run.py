@@ -20,7 +20,7 @@ from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.checkpoint import Journal, read_journal, restore
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.diagnosis import Traffic, warn_of_unused_tokens
+from fusion_gym.training.diagnosis import Traffic, warn_of_silence, warn_of_unused_tokens
 from fusion_gym.training.models import make_env, make_model, warn_of_cross_term
 from fusion_gym.training.monitor import Interrupt, Progress, Stop
 from fusion_gym.validation import ConfigurationError
@@ -135,12 +135,13 @@ def _learn(
         if finished:
             progress.finish()
             if not quiet:
-                warn_of_unused_tokens(scored, progress.run_cheapest())
+                warn_of_unused_tokens(scored, progress.last[0].tokens)
+                warn_of_silence(progress.last)
         progress.save()
         if finished:
             with replacing(folder / "final_model.zip") as partial:
                 model.save(partial)
-    best = max(journal.records, key=lambda record: record["return"], default=None)
+    best = min(journal.records, key=lambda record: record["relative_cost"], default=None)
     summary = {
         "timesteps": model.num_timesteps,
         "finished": finished,
