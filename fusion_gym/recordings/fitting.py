@@ -10,10 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.linalg import solve_discrete_lyapunov
-from statsmodels.regression.linear_model import OLS
-from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.tsa.deterministic import CalendarFourier, DeterministicProcess
-from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, refusal
@@ -98,6 +95,8 @@ class FittedPlant:
             deviations: deviations (T, channels).
             smooth: whether to smooth after filtering.
         """
+        from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+
         count, size = len(self.names), len(self.transition)
         model = KalmanSmoother(k_endog=count, k_states=size)
         model.bind(np.asfortranarray(deviations.T))
@@ -167,12 +166,14 @@ def levels(recording: Recording, share: float) -> tuple[Array, int, Array]:
     least, longest = _CYCLE
     cycle = rows * recording.interval >= least and recording.interval <= longest
     terms = [CalendarFourier("D", 2)] if cycle else []
-    known = DeterministicProcess(index, constant=True, additional_terms=terms).in_sample()
+    process = DeterministicProcess(index, constant=True, additional_terms=terms)
+    known = process.in_sample().to_numpy()
     result, removed = np.empty(values.shape), np.zeros((values.shape[1], 5))
-    for place, name in enumerate(values):
-        first = OLS(values[name].iloc[:rows], known.iloc[:rows], missing="drop").fit()
-        result[:, place] = values[name] - known @ first.params
-        removed[place, : len(first.params)] = first.params
+    for place, column in enumerate(values.to_numpy().T):
+        present = np.flatnonzero(np.isfinite(column[:rows]))
+        first = np.linalg.lstsq(known[present], column[present])[0]
+        result[:, place] = column - known @ first
+        removed[place, : len(first)] = first
     return result, rows, removed
 
 
@@ -290,6 +291,8 @@ def noisy_channels(plant: FittedPlant) -> list[str]:
 
 def residual_correlations(plant: FittedPlant, values: Array) -> Iterator[tuple[str, int, float]]:
     """Yield the largest correlation of each channel's residuals in ten lags, with its lag."""
+    from statsmodels.stats.diagnostic import acorr_ljungbox
+
     residuals = np.asarray(plant.filter(values).standardized_forecasts_error)
     for name, residual in zip(plant.names, residuals, strict=True):
         present = residual[np.isfinite(residual) & (residual != 0.0)]
@@ -332,10 +335,10 @@ def _fit(recording: Recording, values: Array, order: int, exact: bool) -> Fitted
                 f"recording is not allowed with order {order}: {complete.sum()} steps have all "
                 f"readings with those before, and {_LEAST * count * order} must"
             )
-        results = [OLS(column, lags[complete]).fit() for column in now[complete].T]
-        coefficients = np.array([result.params for result in results])
-        residuals = np.array([result.resid for result in results])
-        process = residuals @ residuals.T / results[0].df_resid
+        now, lags = now[complete], lags[complete]
+        coefficients = np.linalg.lstsq(lags, now)[0].T
+        residuals = now - lags @ coefficients.T
+        process = residuals.T @ residuals / (len(now) - np.linalg.matrix_rank(lags))
     else:
         coefficients, process, noise = _expectation_maximisation(values, order, noise, exact)
     transition = np.eye(count * order, k=-count)
