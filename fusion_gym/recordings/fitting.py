@@ -15,7 +15,7 @@ from statsmodels.tsa.deterministic import CalendarFourier, DeterministicProcess
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.recordings.recording import Recording
-from fusion_gym.validation import number
+from fusion_gym.validation import integer, number
 
 RATES = 0.3, 0.2, 0.1, 0.05, 0.02
 RATIOS = 0.8, 1.25  # real over model error without a warning
@@ -28,6 +28,7 @@ _ROWS = 3000  # of a maximum-likelihood fit; least squares takes all
 _CYCLE = pd.Timedelta("7D"), pd.Timedelta("6h")  # least fitted time, longest interval
 _RADIUS = 0.9999  # largest spectral radius of a fitted plant
 _LEAST = 50  # complete steps of a fit, for each number in a row of the regression
+_REGULAR = 1e-10  # least eigenvalue of the correlations of process noise
 _CORRELATION = 0.25  # of residuals in the first ten lags: above it, a warning
 
 
@@ -208,23 +209,29 @@ def fit(
     """
     share = number("share", share, above=0.0, at_most=0.95)
     values, rows = deviations(recording, share)
-    for place, channel in enumerate(recording.channels):
-        count = int(np.isfinite(values[:rows, place]).sum())
-        if count < _LEAST * (1 + len(recording.channels)):
-            raise refusal(
-                "recording", channel.name, f"a channel with at least "
-                f"{_LEAST * (1 + len(recording.channels))} readings in the fitted part, not {count}"
-            )  # fmt: skip
+    least = _LEAST * (1 + len(recording.channels))
+    for channel, column in zip(recording.channels, values[:rows].T, strict=True):
+        known = column[np.isfinite(column)]
+        integer(f"readings of {channel.name} in the fitted part", len(known), at_least=least)
+        number(f"deviation of {channel.name}", float(known.std()), at_least=1e-6)
     train, validation = values[: 2 * rows // 3], values[2 * rows // 3 : rows]
     errors: dict[int, float] = {}
     if order is None and not exact:
         order = 1  # readings hardly tell noise from a second lag
-    for lags in _ORDERS if order is None else ():
-        plant = _fit(recording, train, lags, exact)
-        errors[lags] = criticise(plant, validation, (_TARGET,))[0].real
-    good = _CLOSE * min(errors.values(), default=0.0)
-    order = order or next(lags for lags, error in errors.items() if error <= good)
-    return _fit(recording, values[:rows], order, exact)
+    try:
+        for lags in _ORDERS if order is None else ():
+            plant = _fit(recording, train, lags, exact)
+            errors[lags] = criticise(plant, validation, (_TARGET,))[0].real
+        good = _CLOSE * min(errors.values(), default=0.0)
+        order = order or next(lags for lags, error in errors.items() if error <= good)
+        plant = _fit(recording, values[:rows], order, exact)
+        size = np.sqrt(np.diagonal(plant.process_covariance)[: values.shape[1]])
+        own = plant.process_covariance[: len(size), : len(size)] / np.outer(size, size)
+        np.linalg.cholesky(own - _REGULAR * np.eye(len(size)))
+    except np.linalg.LinAlgError as error:
+        allowed = f"some that do not determine each other ({error})"
+        raise refusal("channels", list(recording.values), allowed) from None
+    return plant
 
 
 def criticise(
