@@ -169,7 +169,7 @@ UNFIT = {
     "a constant": (lambda a: np.where(np.arange(600) < 599, 3.0, 4.0), "deviation of a = "),
     "tiny numbers": (lambda a: 1e-200 * a, "deviation of a = 0.0 is not allowed"),
     "a copy": (lambda a: log(600)["b [m]"].to_numpy(), "some that do not determine each other"),
-    "late": (lambda a: np.where(np.arange(600) < 550, np.nan, a), "readings of a in the fitted part"),
+    "late": (lambda a: np.where(np.arange(600) < 550, np.nan, a), "readings of a in the fitted"),
 }  # fmt: skip
 
 
