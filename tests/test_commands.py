@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shlex
 import subprocess
 import sys
 import typing
@@ -28,6 +29,7 @@ from fusion_gym.training.config import Experiment
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
+PROGRAMS = {command_line.program_of(kind): kind for kind in map(load, EVERY)}
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -38,7 +40,8 @@ def test_help_shows_every_option(
     with pytest.raises(SystemExit) as caught:
         load(name).main()
     assert caught.value.code == 0
-    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    printed = capsys.readouterr().out
+    text = " ".join(printed.replace("│", " ").split())
     program = command_line.program_of(load(name))
     assert text.startswith(f"usage: {program} ")
     assert f" {program} " in text[10:], "no example"
@@ -55,6 +58,14 @@ def test_help_shows_every_option(
             hints.get(option), "__metadata__", ()
         ):
             assert f"--{option.replace('_', '-')} " in listed, option
+    examples = re.findall(r"(?m)^    \S(?:.*\\\n)*.*", printed.partition("╭")[0])
+    assert examples
+    for example in (example.replace("\\\n", "") for example in examples):
+        assert "\\" not in example
+        owner = max(filter(example.lstrip().startswith, PROGRAMS), key=len)
+        words = shlex.split(example)[len(owner.split()) :]
+        monkeypatch.setattr(sys, "argv", ["program", *words])
+        command_line.read_command(PROGRAMS[owner])
 
 
 def test_lists_and_flags_are_read(monkeypatch: pytest.MonkeyPatch) -> None:

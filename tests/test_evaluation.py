@@ -254,12 +254,13 @@ def test_envelope_by_hand() -> None:
         lower_envelope({})
 
 
-def test_the_zoo_and_the_evaluation_come_with_the_package_and_torch_does_not() -> None:
+def test_the_zoo_the_evaluation_and_the_list_do_without_torch() -> None:
     lines = (
         "import sys, fusion_gym",
         "task = fusion_gym.make_task('fusion_gym/TobitOscillator-v1', horizon=3)",
         "fusion_gym.evaluation.run_episodes(task, fusion_gym.make_policy('always', task), 2, 0)",
         "assert fusion_gym.zoo.names() and fusion_gym.policy_names()",
-        "assert not {'torch', 'stable_baselines3'} & sys.modules.keys()",
+        "import fusion_gym.commands.list as command; command.catalogue()",
+        "assert not {'torch', 'stable_baselines3', 'scipy.stats'} & sys.modules.keys()",
     )
     subprocess.run([sys.executable, "-c", "; ".join(lines)], check=True)

@@ -1,5 +1,11 @@
 """Logs of sensors: what a data card says, and what is refused."""
 
+import gzip
+import io
+import lzma
+import os
+import tarfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -76,6 +82,13 @@ REFUSED = {
     "a channel of gaps": (log(d=np.nan), "its channel 'd' has no number"),
     "a channel of infinities": (log(d=np.inf), "its channel 'd' has no number"),
     "an open bracket": (TEXT.replace("b [m]", "b [m"), "the head 'b [m' must be a name"),
+    "limits in reverse": (TEXT.replace("b [m]", "b 5..1"), "a unit and rising limits"),
+    "equal limits": (TEXT.replace("b [m]", "b [m] .5..0.5"), "the head 'b [m] .5..0.5' must be"),
+    "no number in a limit": (TEXT.replace("b [m]", "b [m] ..."), "the head 'b [m] ...' must be"),
+    "a limit of two points": (TEXT.replace("b [m]", "b 1.2.3..4"), "the head 'b 1.2.3..4' must be"),
+    "many columns": ("t" + ",x" * 101, "or 100 channels"),
+    "a line without an end": ("x" * 200_000, "field larger than field limit"),
+    "a channel of huge numbers": (log(d=1e200), "its channel 'd' has no number up to 1e+15"),
     "limits in words": (TEXT.replace("b [m]", "b [m] ..high"), "the head 'b [m] ..high' must be"),
 }
 
@@ -87,6 +100,96 @@ def test_a_log_that_is_none_is_refused_in_one_line(name: str, tmp_path: Path) ->
         read(table, tmp_path)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def archive(kind: str) -> bytes:
+    """A log in a zip or tar archive, or such an archive with damage."""
+    stream = io.BytesIO()
+    form, _, damage = kind.partition(" ")
+    member = tarfile.TarInfo("log.csv")
+    if form == "zip":
+        with zipfile.ZipFile(stream, "w") as file:
+            for name in ("a", "b") if damage == "twice" else ("a",):
+                file.writestr(name, TEXT)
+    else:
+        with tarfile.open(fileobj=stream, mode="w") as file:
+            member.size, member.type = len(TEXT), tarfile.REGTYPE
+            if damage == "link":
+                member.size, member.type, member.linkname = 0, tarfile.LNKTYPE, "other"
+            file.addfile(member, io.BytesIO(TEXT.encode()))
+    raw = bytearray(stream.getvalue())
+    if damage == "encrypted":
+        raw[6] |= 1
+        raw[raw.find(b"PK\x01\x02") + 8] |= 1
+    if damage == "changed":
+        raw[100] ^= 255
+    return bytes(raw[: len(raw) // 4 if damage == "cut" else None])
+
+
+PACKED = {
+    **{f"{form}{' ' * bool(damage)}{damage}": (form, archive(f"{form} {damage}"))
+       for form, damages in (("zip", ("", "cut", "changed", "encrypted", "twice")),
+                             ("tar", ("", "cut", "changed", "link")))
+       for damage in damages},
+    "gz": ("gz", gzip.compress(TEXT.encode())),
+    "gz cut": ("gz", gzip.compress(TEXT.encode())[:500]),
+    "gz no archive": ("gz", TEXT.encode()),
+    "gz nested": ("gz", gzip.compress(gzip.compress(TEXT.encode()))),
+    "gz of zeros": ("gz", gzip.compress(bytes(200_000))),
+    "xz cut": ("xz", lzma.compress(TEXT.encode())[:500]),
+    "zst no archive": ("zst", b"\x28\xb5\x2f\xfd" + bytes(50)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_a_packed_log_is_read_and_a_damaged_one_refused(name: str, tmp_path: Path) -> None:
+    end, content = PACKED[name]
+    path = tmp_path / f"log.csv.{end}"
+    path.write_bytes(content)
+    if name == end:
+        assert Recording.read(path).values.equals(read(TEXT, tmp_path).values)
+        return
+    with pytest.raises(ConfigurationError, match=r"^log = .*it must be a CSV file \(.+\)$"):
+        Recording.read(path)
+
+
+def test_a_log_is_a_regular_file_of_limited_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    for path in (tmp_path / "pipe.csv", tmp_path, Path(os.devnull)):
+        assert "it is no regular file" in refusal("fit", [str(path)])
+    assert "it is no regular file" in refusal("info", [str(tmp_path / "pipe.csv")])
+    monkeypatch.setattr("fusion_gym.recordings.recording.LONGEST_TEXT", len(TEXT) - 1)
+    with pytest.raises(ConfigurationError, match=f"above {len(TEXT) - 1:,} bytes"):
+        read(TEXT, tmp_path)
+
+
+UNFIT = {
+    "a constant": (lambda a: np.where(np.arange(600) < 599, 3.0, 4.0), "deviation of a = "),
+    "tiny numbers": (lambda a: 1e-200 * a, "deviation of a = 0.0 is not allowed"),
+    "a copy": (lambda a: log(600)["b [m]"].to_numpy(), "some that do not determine each other"),
+    "late": (lambda a: np.where(np.arange(600) < 550, np.nan, a), "readings of a in the fitted"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_a_log_without_a_plant_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    values, message = UNFIT[name]
+    for exact in ([], ["--exact"]):
+        read(changed(values), tmp_path)
+        words = ["--share=0.9", "--output", str(tmp_path / "made.yaml"), "--channels", "a", "b"]
+        assert message in refusal("fit", [str(tmp_path / "log.csv"), *words, *exact])
+        assert not (tmp_path / "made.yaml").exists()
+    assert "channels = () is not allowed" in refusal("fit", ["tanks", "--channels"])
+
+
+def test_a_head_without_a_unit_has_limits(tmp_path: Path) -> None:
+    recording = read(TEXT.replace("a [m]", "a b -.5..2").replace("b [m]", "b ..3"), tmp_path)
+    assert recording.channels[:2] == (
+        RecordedChannel("a b", low=-0.5, high=2.0),
+        RecordedChannel("b", high=3.0),
+    )
 
 
 REMARKED = {

@@ -1,5 +1,6 @@
 """Policies side by side on the same noise: the pictures, the command and its films."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,11 @@ def test_the_command_writes_films(
         # 64 colours of a GIF, chroma of a video.
         assert np.abs(observed.astype(int) - drawn).mean() < 3.0
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_device_takes_a_gif() -> None:
+    save_film([np.zeros((8, 8, 3), np.uint8)] * 2, Path(os.devnull), 10)
+    assert Path(os.devnull).is_char_device()
 
 
 def test_a_film_that_fails_leaves_nothing(tmp_path: Path) -> None:

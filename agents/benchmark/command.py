@@ -1,6 +1,6 @@
 """The benchmark: rules and agents of three classes in eight settings, at equal price.
 
-    python -m agents.benchmark [--quick] [--settings NAME …] [--workers 2]
+    python -m agents.benchmark --quick --workers 2
     python -m agents.benchmark --policy 'value_of_information:price={price}' --class scheduler
 
 In every class it freezes five prices, tunes the rules of the literature, searches one rule for all

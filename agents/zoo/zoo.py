@@ -1,6 +1,6 @@
 """Put one agent of each class of the benchmark into the model zoo, with its card.
 
-    python -m agents.zoo [--settings NAME …] [--work runs/benchmark]
+    python -m agents.zoo --work runs/benchmark
 
 The training seed has the least cost in validation, so the test figures are unbiased. The command
 first runs the benchmark's unfinished work. It removes agents of other names. A model has

@@ -19,7 +19,7 @@ from fusion_gym.docstrings import plain_marks
 from fusion_gym.importing import trust_files
 from fusion_gym.output.ending import flush, report_errors
 from fusion_gym.output.progress import quietly
-from fusion_gym.validation import CONTROL, ConfigurationError
+from fusion_gym.validation import CONTROL, ConfigurationError, refusal
 
 Words = tuple[tuple[str, ...], ...]  # words of a repeatable option
 SetOptions = Annotated[
@@ -54,6 +54,9 @@ class Command(ABC):
             sys.path.append(os.getcwd())
         with report_errors(lambda: command.interrupted() if command else "interrupted"):
             command = read_command(cls)
+            for item in fields(command):
+                if f"--{item.name}" in sys.argv and getattr(command, item.name) == ():
+                    raise refusal(item.name, (), "one value or more")
             with (
                 trust_files(getattr(command, "trust", False)),
                 quietly(isinstance(command, Long) and command.quiet),

@@ -1,7 +1,7 @@
 r"""Compare one policy with swept baselines: at its price, and at its rate.
 
-    fusion-gym compare --config configs/biased_oscillator_ppo.yaml \\
-        --sweep configs/biased_sweep.yaml \\
+    fusion-gym compare --config configs/biased_oscillator_ppo.yaml \
+        --sweep configs/biased_sweep.yaml \
         --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
 
 All policies run on the same seeds. An agent that observes the price of a token, or a rule with a

@@ -1,6 +1,6 @@
 """Train two agents and compare them with rules under the same budget, in minutes.
 
-    fusion-gym demo [--output runs/demo] [--episodes 1000] [--resume]
+    fusion-gym demo --output runs/demo --episodes 1000
 
 One agent learns in LinearFusion and one in the Tobit oscillator. Each agent observes all new
 measurements and the price of a token, with memory of unsent measurements. A table shows its cost at

@@ -1,7 +1,7 @@
 r"""Search one rule for all prices of a token; an interrupted search can be resumed.
 
-    fusion-gym search --env fusion_gym/LinearFusion-v2 --set system=plant.yaml token_rate=.5 \\
-        --output runs/search [--resume]
+    fusion-gym search --env fusion_gym/LinearFusion-v2 --set system=plant.yaml token_rate=.5 \
+        --output runs/search
 
 The rule is ``priced_threshold``, whose threshold depends on the price, the tokens and the age. The
 search over its dozen numbers (CMA-ES) starts from the best single threshold at each price. The

@@ -1,6 +1,6 @@
 r"""Watch one or two policies through an episode, in a window or as a film.
 
-    fusion-gym watch --env fusion_gym/TobitOscillator-v1 --policy dynamic_event \\
+    fusion-gym watch --env fusion_gym/TobitOscillator-v1 --policy dynamic_event \
         --against innovation_threshold:threshold=1 --save episode.gif
 
 Both policies meet the same noise. Their pictures stand side by side and share their axes: states

@@ -69,8 +69,8 @@ class EpisodeResults:
 def run_episodes(
     task: Task,
     policy: Policy,
-    episodes: int,
-    seed: int,
+    episodes: int = 100,
+    seed: int = 0,
     progress: Callable[[int], Any] | None = None,
 ) -> EpisodeResults:
     """Run a policy on episodes with consecutive seeds from ``seed``.

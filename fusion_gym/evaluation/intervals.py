@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from fusion_gym.arrays import Array
 
@@ -52,6 +51,8 @@ def mean_interval(samples: Array, seed: int = 0, level: float = LEVEL) -> Interv
     mean = float(np.mean(samples))
     if len(samples) < 2 or float(np.ptp(samples)) == 0.0:
         return Interval(mean, mean, mean)
+    from scipy import stats  # takes a third of a second
+
     result = stats.bootstrap(
         (samples,),
         np.mean,

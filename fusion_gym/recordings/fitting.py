@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.linalg import solve_discrete_lyapunov
-from statsmodels.regression.linear_model import OLS
-from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.tsa.deterministic import CalendarFourier, DeterministicProcess
-from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.recordings.recording import Recording
-from fusion_gym.validation import number
+from fusion_gym.validation import integer, number
 
 RATES = 0.3, 0.2, 0.1, 0.05, 0.02
 RATIOS = 0.8, 1.25  # real over model error without a warning
@@ -31,6 +28,7 @@ _ROWS = 3000  # of a maximum-likelihood fit; least squares takes all
 _CYCLE = pd.Timedelta("7D"), pd.Timedelta("6h")  # least fitted time, longest interval
 _RADIUS = 0.9999  # largest spectral radius of a fitted plant
 _LEAST = 50  # complete steps of a fit, for each number in a row of the regression
+_REGULAR = 1e-10  # least eigenvalue of the correlations of process noise
 _CORRELATION = 0.25  # of residuals in the first ten lags: above it, a warning
 
 
@@ -98,6 +96,8 @@ class FittedPlant:
             deviations: deviations (T, channels).
             smooth: whether to smooth after filtering.
         """
+        from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+
         count, size = len(self.names), len(self.transition)
         model = KalmanSmoother(k_endog=count, k_states=size)
         model.bind(np.asfortranarray(deviations.T))
@@ -167,12 +167,14 @@ def levels(recording: Recording, share: float) -> tuple[Array, int, Array]:
     least, longest = _CYCLE
     cycle = rows * recording.interval >= least and recording.interval <= longest
     terms = [CalendarFourier("D", 2)] if cycle else []
-    known = DeterministicProcess(index, constant=True, additional_terms=terms).in_sample()
+    process = DeterministicProcess(index, constant=True, additional_terms=terms)
+    known = process.in_sample().to_numpy()
     result, removed = np.empty(values.shape), np.zeros((values.shape[1], 5))
-    for place, name in enumerate(values):
-        first = OLS(values[name].iloc[:rows], known.iloc[:rows], missing="drop").fit()
-        result[:, place] = values[name] - known @ first.params
-        removed[place, : len(first.params)] = first.params
+    for place, column in enumerate(values.to_numpy().T):
+        present = np.flatnonzero(np.isfinite(column[:rows]))
+        first = np.linalg.lstsq(known[present], column[present])[0]
+        result[:, place] = column - known @ first
+        removed[place, : len(first)] = first
     return result, rows, removed
 
 
@@ -207,23 +209,29 @@ def fit(
     """
     share = number("share", share, above=0.0, at_most=0.95)
     values, rows = deviations(recording, share)
-    for place, channel in enumerate(recording.channels):
-        count = int(np.isfinite(values[:rows, place]).sum())
-        if count < _LEAST * (1 + len(recording.channels)):
-            raise refusal(
-                "recording", channel.name, f"a channel with at least "
-                f"{_LEAST * (1 + len(recording.channels))} readings in the fitted part, not {count}"
-            )  # fmt: skip
+    least = _LEAST * (1 + len(recording.channels))
+    for channel, column in zip(recording.channels, values[:rows].T, strict=True):
+        known = column[np.isfinite(column)]
+        integer(f"readings of {channel.name} in the fitted part", len(known), at_least=least)
+        number(f"deviation of {channel.name}", float(known.std()), at_least=1e-6)
     train, validation = values[: 2 * rows // 3], values[2 * rows // 3 : rows]
     errors: dict[int, float] = {}
     if order is None and not exact:
         order = 1  # readings hardly tell noise from a second lag
-    for lags in _ORDERS if order is None else ():
-        plant = _fit(recording, train, lags, exact)
-        errors[lags] = criticise(plant, validation, (_TARGET,))[0].real
-    good = _CLOSE * min(errors.values(), default=0.0)
-    order = order or next(lags for lags, error in errors.items() if error <= good)
-    return _fit(recording, values[:rows], order, exact)
+    try:
+        for lags in _ORDERS if order is None else ():
+            plant = _fit(recording, train, lags, exact)
+            errors[lags] = criticise(plant, validation, (_TARGET,))[0].real
+        good = _CLOSE * min(errors.values(), default=0.0)
+        order = order or next(lags for lags, error in errors.items() if error <= good)
+        plant = _fit(recording, values[:rows], order, exact)
+        size = np.sqrt(np.diagonal(plant.process_covariance)[: values.shape[1]])
+        own = plant.process_covariance[: len(size), : len(size)] / np.outer(size, size)
+        np.linalg.cholesky(own - _REGULAR * np.eye(len(size)))
+    except np.linalg.LinAlgError as error:
+        allowed = f"some that do not determine each other ({error})"
+        raise refusal("channels", list(recording.values), allowed) from None
+    return plant
 
 
 def criticise(
@@ -290,6 +298,8 @@ def noisy_channels(plant: FittedPlant) -> list[str]:
 
 def residual_correlations(plant: FittedPlant, values: Array) -> Iterator[tuple[str, int, float]]:
     """Yield the largest correlation of each channel's residuals in ten lags, with its lag."""
+    from statsmodels.stats.diagnostic import acorr_ljungbox
+
     residuals = np.asarray(plant.filter(values).standardized_forecasts_error)
     for name, residual in zip(plant.names, residuals, strict=True):
         present = residual[np.isfinite(residual) & (residual != 0.0)]
@@ -332,10 +342,10 @@ def _fit(recording: Recording, values: Array, order: int, exact: bool) -> Fitted
                 f"recording is not allowed with order {order}: {complete.sum()} steps have all "
                 f"readings with those before, and {_LEAST * count * order} must"
             )
-        results = [OLS(column, lags[complete]).fit() for column in now[complete].T]
-        coefficients = np.array([result.params for result in results])
-        residuals = np.array([result.resid for result in results])
-        process = residuals @ residuals.T / results[0].df_resid
+        now, lags = now[complete], lags[complete]
+        coefficients = np.linalg.lstsq(lags, now)[0].T
+        residuals = now - lags @ coefficients.T
+        process = residuals.T @ residuals / (len(now) - np.linalg.matrix_rank(lags))
     else:
         coefficients, process, noise = _expectation_maximisation(values, order, noise, exact)
     transition = np.eye(count * order, k=-count)

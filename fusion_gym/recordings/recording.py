@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 import re
 from collections.abc import Sequence
@@ -12,16 +14,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pandas.io.common import get_handle
 
 from fusion_gym.arrays import Array
-from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.errors import ConfigurationError, display, refusal
+from fusion_gym.validation import LARGEST, LONGEST, LONGEST_TEXT
 
 # Shipped logs by name: three made-up tanks, and a wind mast (from brightwind 2.7.0, MIT).
 SHIPPED = {name: Path(__file__).with_name(f"{name}.csv{end}")
            for name, end in (("tanks", ""), ("mast", ".xz"))}  # fmt: skip
+_LIMIT = r"-?[0-9]+(?:\.[0-9]+)?|-?\.[0-9]+"
+_ENDS = {"low": -np.inf, "high": np.inf}
 _HEAD = re.compile(
-    r"(?P<name>[^\[\]]*[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?"
-    r"(\s+(?P<low>-?[\d.]+)?\.\.(?P<high>-?[\d.]+)?)?"
+    r"(?P<name>[^\[\]]*?[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?"
+    rf"(\s+(?P<low>{_LIMIT})?\.\.(?P<high>{_LIMIT})?)?"
 )
 _LEAST, _MOST = 20, 5_000_000  # rows of a log, and steps from its first to its last time
 _OFF = 0.05  # of an interval: a time that is farther from the even times is counted
@@ -144,13 +150,13 @@ class Recording:
             if not pd.api.types.is_numeric_dtype(numbers[name]):
                 plain = numbers[name].astype("string").str.strip().str.replace(",", ".")
                 numbers[name] = pd.to_numeric(plain, errors="coerce")
-        numbers = numbers.astype(float).where(np.isfinite(numbers.astype(float)))
+        numbers = numbers.astype(float).where(numbers.astype(float).abs() <= LARGEST)
         lost = int((texts & numbers.isna()).to_numpy().sum())
-        remarks += [f"{lost} cells without a finite number: no reading"] if lost else []
+        remarks += [f"{lost} cells without a finite number up to 1e15: no reading"] if lost else []
         for name in names:
             if numbers[name].isna().all():
                 raise ConfigurationError(
-                    f"{source} is not allowed: its channel {name!r} has no number"
+                    f"{source} is not allowed: its channel {name!r} has no number up to {LARGEST:g}"
                 )
         values = _on_even_times(numbers, times, source, remarks)
         return cls(values, tuple(channels), tuple(remarks))
@@ -248,29 +254,32 @@ class Recording:
 def _table(path: Path) -> pd.DataFrame:
     """Return the cells of a CSV file, with the separator of its first line."""
     try:
-        head = pd.read_csv(path, sep="\0", engine="python", header=None, nrows=1, dtype=str)
-        line = str(head.iloc[0, 0])
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no regular file")
+        with get_handle(path, "rb", compression="infer", is_text=False) as handle:
+            raw = handle.handle.read(LONGEST_TEXT + 1)
+        text = raw.decode("utf-8-sig")
+        line = text.lstrip().partition("\n")[0]
         separator = max(",;\t", key=line.count)
-        return pd.read_csv(path, sep=separator, skipinitialspace=True, encoding="utf-8-sig")
-    except (OSError, ValueError, UnicodeError, EOFError) as error:
+        columns = len(next(csv.reader([line], delimiter=separator), []))
+        if len(raw) > LONGEST_TEXT or columns > 1 + LONGEST:
+            raise ValueError(f"above {LONGEST_TEXT:,} bytes or {LONGEST} channels")
+        return pd.read_csv(io.StringIO(text), sep=separator, skipinitialspace=True)
+    except Exception as error:  # a damaged archive may raise any exception
         reason = getattr(error, "strerror", None) or " ".join(str(error).split()[:20])
-        raise refusal("log", str(path), f"a CSV file ({reason})") from None
+        allowed = f"a CSV file ({reason or type(error).__name__})"
+        raise refusal("log", str(path), allowed) from None
 
 
 def _channel(head: str, source: str) -> RecordedChannel:
-    match = _HEAD.fullmatch(head.strip())
-    if match is None:
+    match = _HEAD.fullmatch(" ".join(head.split()))
+    low, high = (float(match[end] or size) if match else 0 for end, size in _ENDS.items())
+    if match is None or ".." in match["name"] or not low < high:
         raise ConfigurationError(
-            f"{source} is not allowed: the head {head!r} must be a name, perhaps with a unit and "
-            "limits, as in 'humidity [%] 0..100'"
+            f"{source} is not allowed: the head {display(head)} must be a name, perhaps with a "
+            "unit and rising limits, as in 'humidity [%] 0..100'"
         )
-    low, high = (float(match[end]) if match[end] else np.nan for end in ("low", "high"))
-    return RecordedChannel(
-        match["name"],
-        match["unit"] or "",
-        -np.inf if np.isnan(low) else low,
-        np.inf if np.isnan(high) else high,
-    )
+    return RecordedChannel(match["name"], match["unit"] or "", low, high)
 
 
 def _times(cells: pd.Series, source: str, remarks: list[str]) -> pd.Series:

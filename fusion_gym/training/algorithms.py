@@ -10,20 +10,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import pydantic
-import torch
-from sb3_contrib import MaskablePPO, RecurrentPPO
-from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.utils import LinearSchedule
 
 from fusion_gym.docstrings import table
+from fusion_gym.importing import import_named
 from fusion_gym.training.checked import Positive, Rate, Several, Share, Strict, Weight
-from fusion_gym.training.counterfactual import (
-    Counterfactual,
-    CounterfactualMaskablePPO,
-    CounterfactualPPO,
-)
-from fusion_gym.training.decisions import Kind
 from fusion_gym.validation import choice
 
 # Share of the steps in which the untrained policy requests each sensor; by default one half. Far
@@ -50,6 +40,9 @@ class AlgorithmConfig(Strict):
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the algorithm's class."""
+        import torch
+        from stable_baselines3.common.utils import LinearSchedule
+
         value = self.model_dump(exclude={"name", "learning_rate_end", "network"})
         if self.learning_rate_end is not None:
             value["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
@@ -99,7 +92,7 @@ class CounterfactualConfig(PPOConfig):
     n_steps: Positive = 32
     batch_size: Several = 1024
     n_epochs: Positive = 8
-    alternatives: Kind | None = None
+    alternatives: Literal["all", "flips"] | None = None
     path_credit: bool = True
 
 
@@ -136,7 +129,7 @@ class Algorithm:
     RecurrentPPO accepts MultiBinary actions but fails on them during training.
 
     Args:
-        model: class of the algorithm.
+        place: ``module:name`` of its class.
         config: class of its settings.
         meaning: its meaning, in a few words.
         source: paper or library.
@@ -144,7 +137,7 @@ class Algorithm:
         discrete_only: whether only Discrete actions are possible.
     """
 
-    model: type[BaseAlgorithm]
+    place: str
     config: type[AlgorithmConfig]
     meaning: str
     source: str
@@ -152,35 +145,44 @@ class Algorithm:
     discrete_only: bool = False
 
     @property
+    def model(self) -> Any:
+        """Class of the algorithm, whose import takes seconds."""
+        return import_named("algorithm", self.place)
+
+    @property
     def privileged(self) -> bool:
         """Whether it learns from information that no policy may use."""
-        return issubclass(self.model, Counterfactual)
+        return self.place.startswith(_OWN)
 
 
+_OWN, _SB3, _MORE = "fusion_gym.training.counterfactual:", "stable_baselines3:", "sb3_contrib:"
 _CREDIT = "this library ([Learning](learning.md))"
 TABLE = {
     "a2c": Algorithm(
-        A2C, A2CConfig, "advantage actor-critic", "V. Mnih et al., ICML 2016 (arXiv 1602.01783)"
+        f"{_SB3}A2C", A2CConfig, "advantage actor-critic",
+        "V. Mnih et al., ICML 2016 (arXiv 1602.01783)",
     ),
     "counterfactual_maskable_ppo": Algorithm(
-        CounterfactualMaskablePPO, CounterfactualConfig,
+        f"{_OWN}CounterfactualMaskablePPO", CounterfactualConfig,
         "PPO with counterfactual credit and the mask of `maskable_ppo`", _CREDIT,
     ),
     "counterfactual_ppo": Algorithm(
-        CounterfactualPPO, CounterfactualConfig, "PPO with counterfactual credit", _CREDIT
+        f"{_OWN}CounterfactualPPO", CounterfactualConfig, "PPO with counterfactual credit", _CREDIT
     ),
     "dqn": Algorithm(
-        DQN, DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602", discrete_only=True
+        f"{_SB3}DQN", DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602",
+        discrete_only=True,
     ),
     "maskable_ppo": Algorithm(
-        MaskablePPO, PPOConfig, "PPO with a mask of the requests that the tokens deny",
+        f"{_MORE}MaskablePPO", PPOConfig, "PPO with a mask of the requests that the tokens deny",
         "S. Huang and S. Ontañón, arXiv 2006.14171",
     ),
     "ppo": Algorithm(
-        PPO, PPOConfig, "proximal policy optimisation", "J. Schulman et al., arXiv 1707.06347"
+        f"{_SB3}PPO", PPOConfig, "proximal policy optimisation",
+        "J. Schulman et al., arXiv 1707.06347",
     ),
     "recurrent_ppo": Algorithm(
-        RecurrentPPO, RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
+        f"{_MORE}RecurrentPPO", RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
         "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy", discrete_only=True,
     ),
 }  # fmt: skip
