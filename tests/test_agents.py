@@ -151,8 +151,15 @@ def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
     assert difference["mean"] == pytest.approx(random["mse"]["mean"] - always["mse"]["mean"])
 
 
-def test_demo_from_training_to_figures(tmp_path: Path) -> None:
-    words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "4096"]
+def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the demo's agents, with short episodes and small batches."""
+    for name, config in demo.CONFIGS.items():
+        content = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())
+        content["environment"]["options"] |= {"horizon": 10, "price_range": [0.01, 1.0]}
+        content["training"]["num_envs"] = content["validation"]["episodes"] = 16
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
+        monkeypatch.setitem(demo.CONFIGS, name, str(tmp_path / f"{name}.yaml"))
+    words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "256"]
     printed = succeed("demo", words).out
     for name in demo.CONFIGS:
         folder = tmp_path / name

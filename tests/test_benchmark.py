@@ -164,8 +164,16 @@ def test_prices_are_slopes_of_the_front(monkeypatch: pytest.MonkeyPatch) -> None
     assert prices == pytest.approx([share**-2 for share in shares], rel=0.02)
 
 
-def test_all_tasks_and_rules_of_the_benchmark_exist() -> None:
-    suite = load_suite()
+def test_all_tasks_and_rules_of_the_benchmark_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    suite, tasks, make = load_suite(), {}, settings.Setting.task
+
+    def task_once(setting: Any, name: Any, memory: bool | None = None, case: Any = None) -> Any:
+        memory = setting.has_memory(name) if memory is None else memory
+        key = setting.name, memory, case and case.name
+        tasks[key] = tasks.get(key) or make(setting, name, memory, case)
+        return tasks[key]
+
+    monkeypatch.setattr(settings.Setting, "task", task_once)
     assert len(suite.settings) == 8
     for setting in suite.settings:
         for name in CLASSES:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from fusion_gym.commands import field
 from fusion_gym.commands.field import AGENT, Field
 from fusion_gym.evaluation import field_study
 from fusion_gym.evaluation.field_study import (
@@ -91,10 +92,12 @@ def test_errors_are_means_of_the_steps_with_readings() -> None:
 def test_a_study_ends_in_the_settings_of_devices(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(field_study, "_TRIALS", 4)
-    monkeypatch.setattr(field_study, "_EPISODES", 8)
+    few = {"_TRIALS": 2, "_EPISODES": 4, "_CLOSE": 0.5, "FACTORS": (0.5, 1.0, 2.0), "RESAMPLES": 20}
+    for name, value in few.items():
+        monkeypatch.setattr(field_study, name, value)
+    monkeypatch.setattr(field, "_WINDOWS", 150)  # of 20 steps
     folder = tmp_path / "field"
-    words = ["tanks", "--exact", "--output", str(folder), "--timesteps", "4000", "--workers", "1"]
+    words = ["tanks", "--exact", "--output", str(folder), "--timesteps", "2000", "--workers", "1"]
     printed = succeed("field", words).out
     settings = yaml.safe_load((folder / "devices.yaml").read_text())
     assert list(settings) == ["inflow", "middle", "outflow"]

@@ -23,7 +23,7 @@ from fusion_gym.jax import FiveValueEnv, FunctionalEnv
 from fusion_gym.validation import ConfigurationError
 
 HORIZON, EPISODES = 30, 3
-TOBIT = "fusion_gym/TobitOscillator-v1"
+TOBIT, LINEAR = "fusion_gym/TobitOscillator-v1", "fusion_gym/LinearFusion-v2"
 RULES = (
     "innovation_threshold:threshold=1.1",
     "innovation_threshold:threshold=1.1,whitened=true,at_most=1",
@@ -116,9 +116,11 @@ def test_interfaces_of_learners_and_rules_run_under_jax() -> None:
 
 def test_runs_together_are_the_runs_alone() -> None:
     env, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", horizon=4)
+    reset, step_alone = jax.jit(env.reset), jax.jit(env.step)
+    step_together = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
     keys = jax.random.split(jax.random.key(0), 3)
-    alone = [env.reset(key, params) for key in keys]
-    observation, together = jax.vmap(env.reset, (0, None))(keys, params)
+    alone = [reset(key, params) for key in keys]
+    observation, together = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)
     for step in range(6):
         for run, (seen, state) in enumerate(alone):
             own = jax.tree.map(lambda x, run=run: x[run], (observation, together))
@@ -128,29 +130,26 @@ def test_runs_together_are_the_runs_alone() -> None:
             together = together._replace(limit=np.array([[4], [3], [4]]))
         action = np.arange(6).reshape(3, 2) % 2
         alone = [
-            env.step(k, s, a, params)[:2] for k, (_, s), a in zip(keys, alone, action, strict=True)
+            step_alone(k, s, a, params)[:2]
+            for k, (_, s), a in zip(keys, alone, action, strict=True)
         ]
-        observation, together, *_ = jax.vmap(env.step, (0, 0, 0, None))(
-            keys, together, action, params
-        )
+        observation, together, *_ = step_together(keys, together, action, params)
 
 
 def test_an_episode_that_ends_is_reset() -> None:
-    env, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", horizon=3)
-    key = jax.random.key(0)
-    _, state = env.reset(key, params)
+    env, params = fusion_gym.jax.make(SMALL, horizon=3)
+    key, step = jax.random.key(0), jax.jit(env.step)
+    _, state = jax.jit(env.reset)(key, params)
     for number in range(1, 7):
         key, own = jax.random.split(key)
-        observation, state, _, terminated, truncated, info = env.step(
-            own, state, np.array([1, 0]), params
-        )
+        observation, state, _, terminated, truncated, info = step(own, state, ACTION, params)
         assert (bool(terminated), bool(truncated)) == (False, number % 3 == 0)
         assert int(state.steps[0]) == number % 3
         same = np.array_equal(observation, info["final_observation"])
         assert same == (number % 3 != 0)
-    env, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", horizon=1, clock=True)
-    *_, terminated, truncated, _ = env.step(
-        key, env.reset(key, params)[1], np.array([1, 0]), params
+    env, params = fusion_gym.jax.make(SMALL, horizon=1, clock=True)
+    *_, terminated, truncated, _ = jax.jit(env.step)(
+        key, jax.jit(env.reset)(key, params)[1], ACTION, params
     )
     assert bool(terminated)
     assert not bool(truncated)
@@ -165,31 +164,34 @@ def test_an_action_of_another_shape_is_refused() -> None:
 
 
 def test_parameters_may_be_mapped() -> None:
-    env, params = fusion_gym.jax.make("fusion_gym/TobitOscillator-v1", filter="tobit")
-    key = jax.random.key(0)
+    env, params = fusion_gym.jax.make(LINEAR)
+    key, request, reset = jax.random.key(0), np.array([1, 0]), jax.jit(env.reset)
 
+    @jax.jit
     def reward(variance: Any) -> Any:
         changed = params._replace(measurement_variance=variance)
         _, state = env.reset(key, changed)
-        return env.step(key, state, np.ones(3), changed)[2]
+        return env.step(key, state, np.ones(2), changed)[2]
 
     variances = np.stack([factor * params.measurement_variance for factor in (0.5, 1.0, 2.0)])
-    together = jax.vmap(reward)(variances)
+    together = jax.jit(jax.vmap(reward))(variances)
     np.testing.assert_allclose(together, [reward(v) for v in variances], rtol=1e-12)
     assert len(set(together.tolist())) == 3
     rule = fusion_gym.make_policy("innovation_threshold", env.task)
-    state, thresholds = env.reset(key, params)[1], np.linspace(0.0, 2.0, 9)
-    requests = jax.vmap(lambda x: replace(rule, threshold=x)(env.signals(state)))(thresholds)
-    each = [replace(rule, threshold=x)(env.signals(state)) for x in thresholds.tolist()]
+    state, thresholds = reset(key, params)[1], np.linspace(0.0, 2.0, 9)
+    decide = jax.jit(lambda x: replace(rule, threshold=x)(env.signals(state)))
+    requests = jax.jit(jax.vmap(decide))(thresholds)
+    each = [decide(x) for x in thresholds.tolist()]
     np.testing.assert_array_equal(requests, each)
-    certain = env.expected_step(np.ones((7, 1)), state, np.array([1.0, 0.0, 1.0]), params)
-    _, *step = env.step_env(np.ones((7, 1)), state, np.array([1, 0, 1]), params)
+    noise = np.ones((env.task.system.noise_channels, 1))
+    certain = jax.jit(env.expected_step)(noise, state, 1.0 * request, params)
+    _, *step = jax.jit(env.step_env)(noise, state, request, params)
     for ours, theirs in zip(jax.tree.leaves(certain), jax.tree.leaves(step), strict=True):
         if ours.dtype == np.float64:
             np.testing.assert_allclose(ours, theirs, rtol=1e-12)
     dear = params._replace(price=100.0)
-    _, state = env.reset(key, dear)
-    info = env.step(key, state, np.ones(3), dear)[-1]
+    _, state = reset(key, dear)
+    info = jax.jit(env.step)(key, state, np.ones(2), dear)[-1]
     assert float(info["reward_cost"]) == -100.0 * float(info["cost"]) < 0.0
 
 
@@ -211,7 +213,6 @@ def test_what_jax_does_not_run_is_refused(name: str, options: dict[str, Any], fi
         gymnasium.make(f"fusion_gym/{name}", backend="jax", **options)
 
 
-LINEAR = "fusion_gym/LinearFusion-v2"
 SMALL = "fusion_gym/RemoteEstimation-v1"  # compiles soonest
 ACTION = np.array([1])
 MAKERS: dict[str, Callable[..., Any]] = {

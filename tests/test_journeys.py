@@ -13,6 +13,13 @@ import fusion_gym
 
 ROOT = Path(__file__).parent.parent
 JOURNEYS = {path.stem: path.read_text() for path in (ROOT / "tests" / "journeys").glob("*.py")}
+SLOW = pytest.mark.slow
+FEW = {
+    "1e-3, n_steps=32, batch_size=512": "2e-3, n_steps=8, batch_size=256",
+    "300_000": "81_920",
+    "episodes=100": "episodes=30",
+    "episodes=400": "episodes=100",
+}
 PAGES = {
     "step": "README.md",
     "evaluate": "README.md",
@@ -24,10 +31,15 @@ PAGES = {
 LIBRARIES = {"fusion_gym", "gymnasium", "numpy", "stable_baselines3"}
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_it_runs_in_an_empty_folder(name: str, tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(JOURNEYS[name])
+@pytest.mark.parametrize(
+    ("name", "few"), [*((name, True) for name in PAGES), pytest.param("train", False, marks=SLOW)]
+)
+def test_it_runs_in_an_empty_folder(name: str, few: bool, tmp_path: Path) -> None:
+    """With fewer steps and episodes; the slow one trains as the page does."""
+    script, text = tmp_path / "script.py", JOURNEYS[name]
+    for many, less in FEW.items() if few else ():
+        text = text.replace(many, less)
+    script.write_text(text)
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", script.name],
         cwd=tmp_path,

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from command_runs import call
+from command_runs import refusal, succeed
 from rules import make_rule
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -254,16 +254,16 @@ def test_commands_train_and_evaluate_in_a_variant(own: Path) -> None:
         output: trained
         """
     )
-    refused = call("train", ["--config", "training.yaml"])
-    assert "names code" in refused.err
-    assert "--trust" in refused.err
-    command(own, "train", "--config", "training.yaml", "--trust")
+    error = refusal("train", ["--config", "training.yaml"])
+    assert "names code" in error
+    assert "--trust" in error
+    del sys.modules["own_variants"], gym.registry["mine/Tobit-v0"]  # the command imports them
+    succeed("train", ["--config", "training.yaml", "--trust"])
     policies = ["--policies", "always", "model:trained/best_model.zip", "--episodes", "8"]
     given = ["--config", "trained/config.yaml", "--trust", *policies]
-    command(own, "evaluate", *given, "--json", "variant.json")
+    succeed("evaluate", [*given, "--json", "variant.json"])
     base = ["filter=tobit", "token_rate=2", "max_episode_steps=7", "memory=true"]
-    ended = call("evaluate", ["--env", TOBIT, "--set", *base, *policies, "--json", "base.json"])
-    assert ended.status == 0, ended.err
+    succeed("evaluate", ["--env", TOBIT, "--set", *base, *policies, "--json", "base.json"])
     variant, same = (json.loads((own / f"{name}.json").read_text()) for name in ("variant", "base"))
     assert variant.pop("env") == VARIANT
     assert same.pop("env") == TOBIT

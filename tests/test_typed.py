@@ -18,7 +18,8 @@ from fusion_gym.envs.registration import ENVIRONMENTS, FusionSpec, class_name, o
 
 ROOT = Path(__file__).parent.parent
 USER = ROOT / "tests" / "typed_user.py"
-STRICT = "[mypy]\nstrict = True\n[mypy-torch.*]\nfollow_imports = skip\n"  # torch takes a minute
+SKIPPED = ",".join(f"mypy-{name}.*" for name in ("torch", "jax", "jaxlib", "pygame"))  # large ones
+STRICT = f"[mypy]\nstrict = True\n[{SKIPPED}]\nfollow_imports = skip\n"
 
 
 @pytest.fixture(scope="module")
