@@ -24,7 +24,7 @@ def unsearched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make policies without the search for their schedule, which takes minutes."""
     import numpy as np
 
-    from fusion_gym.policies.schedule_file import Schedule
+    from fusion_gym.policies.periodic_optimum import Schedule
 
     def optimum(system: Any, packets: int, period: int, *_: Any) -> Schedule:
         return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))

@@ -295,7 +295,6 @@ CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
         (TOBIT, CENTRE, VALUE, ("information = 'centre'",)),
         (MARKOV, {}, f"{OPTIMUM}:packets=19", ("packets = 19", "<= 18")),
         (MARKOV, {}, f"{OPTIMUM}:packets=12,period=8", ("packets = 12", "2704156 schedules")),
-        (MARKOV, {}, f"{OPTIMUM}:cache=/dev/null/x,packets=1,period=1", ("cache = ", "written")),
         (MARKOV, {"access": "single"}, OPTIMUM, ("access = 'single'", "'any'")),
         (MARKOV, {"filter": "imm"}, OPTIMUM, ("CentralSystem", "depend only on deliveries")),
     ],

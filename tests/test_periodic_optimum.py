@@ -1,8 +1,6 @@
 """The exhaustive periodic schedule: known optima, the recursion by itself, its cache, refusals."""
 
 import itertools
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -107,57 +105,6 @@ def test_a_search_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
         PeriodicOptimum(markov(fusion="ci"), 2, 3)
     with pytest.raises(TypeError):
         PeriodicOptimum(markov(), 2, 3, average="episode")
-
-
-def test_a_file_holds_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "new" / "schedules.json"
-    text = f"periodic_optimum:packets=2,period=3,cache={path}"
-    first: Any = make_policy(text, markov())
-    assert [entry.name for entry in path.parent.iterdir()] == ["schedules.json"]
-    PeriodicOptimum(markov(), 1, 3, str(path))  # beside the first
-    monkeypatch.setattr(periodic_optimum, "_cache", {})
-    monkeypatch.setattr(periodic_optimum, "_search", None)
-    before = path.read_bytes()
-    again: Any = make_policy(text, markov())
-    np.testing.assert_array_equal(again.schedule, first.schedule)
-    assert again.schedule.dtype == np.bool_
-    assert again.trace == first.trace
-    assert path.read_bytes() == before
-    assert len(json.loads(before)["periodic_optimum"]) == 2
-
-
-@pytest.mark.parametrize("text", ["{", '{"periodic_optimum": [1]}', "\x00\xff"])
-def test_a_broken_or_foreign_file_is_replaced(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "schedules.json"
-    path.write_text(text, encoding="latin-1")
-    PeriodicOptimum(markov(), 1, 2, str(path))
-    (entry,) = json.loads(path.read_text())["periodic_optimum"].values()
-    assert np.sum(entry["requests"]) == 1
-
-
-@pytest.mark.parametrize(
-    "entry",
-    [
-        None,
-        {"requests": [[1, 0, 0]], "trace": 1.0},
-        {"requests": [[0.5, 0.5, 0], [0, 0, 0]], "trace": 1.0},
-        {"requests": [[1, 0, 0], [0, 0, 0]], "trace": -1.0},
-    ],
-)
-def test_an_entry_that_cannot_be_true_is_reproduced(
-    tmp_path: Path, entry: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "schedules.json"
-    right = PeriodicOptimum(markov(), 1, 2, str(path))
-    saved = json.loads(path.read_text())
-    (key,) = saved["periodic_optimum"]
-    path.write_text(json.dumps({"periodic_optimum": {key: entry, "another": 1}}))
-    monkeypatch.setattr(periodic_optimum, "_cache", {})
-    result = PeriodicOptimum(markov(), 1, 2, str(path))
-    np.testing.assert_array_equal(result.schedule, right.schedule)
-    assert result.trace == right.trace
-    after = json.loads(path.read_text())["periodic_optimum"]
-    assert after == saved["periodic_optimum"] | {"another": 1}
 
 
 # --- refusals ------------------------------------------------------------------------------------

@@ -1,24 +1,20 @@
 """The best periodic schedule, a reference for covariances that do not depend on the data."""
 
+import hashlib
 import itertools
 import math
+import pickle
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Knowledge, Signals, System
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.schedule_file import (
-    Patterns,
-    Schedule,
-    load_schedule,
-    schedule_key,
-    store_schedule,
-)
 from fusion_gym.validation import ConfigurationError
 
 _MOST = 200_000  # schedules of one search
@@ -26,6 +22,16 @@ _TOGETHER = 4096  # schedules in one batch
 _LONGEST = 1000  # steps until traces settle, at most
 _SETTLED = 1e-9  # relative change of a settled trace from one cycle to the next
 AVERAGES = ("steady", "episode")
+
+Patterns = NDArray[np.bool_]
+
+
+class Schedule(NamedTuple):
+    """Requests (period, sensors) bool from the start of an episode, and their mean ``trace``."""
+
+    requests: Patterns
+    trace: float
+
 
 _cache: dict[str, Schedule] = {}
 
@@ -50,13 +56,12 @@ class PeriodicOptimum:
     the transient. ``"episode"`` takes the mean over the task's horizon from the start, as an
     evaluation does; it is the right choice where the plant or a node never settles.
 
-    The process caches the result of a search, and with ``cache`` a file does.
+    The process caches the result of a search.
 
     Args:
         task: the task; a text cannot set it.
         packets: q, the requests of all sensors in a period.
         period: p, in steps.
-        cache: path of a file that stores the schedule; None for none.
         average: ``steady`` for the steady state, or ``episode`` for an episode from its start.
 
     Raises:
@@ -91,14 +96,11 @@ class PeriodicOptimum:
         task: Task,
         packets: int = 4,
         period: int = 6,
-        cache: str | None = None,
         average: str = "steady",
     ) -> None:
         validation.integer("period", period, at_least=1, at_most=validation.MOST_STEPS)
         validation.integer("packets", packets, at_least=1, at_most=period * task.sensors)
         validation.choice("average", average, AVERAGES)
-        if cache is not None and not isinstance(cache, str):
-            raise ConfigurationError(f"cache = {cache!r} is not allowed: it must be a path")
         if task.access != "any":
             raise ConfigurationError(
                 f"access = {task.access!r} is not allowed with policy 'periodic_optimum': it must "
@@ -113,7 +115,7 @@ class PeriodicOptimum:
                 "use a smaller period"
             )
         steps = task.horizon if average == "episode" else None
-        self.schedule, self.trace = optimum(task.system, packets, period, cache, steps)
+        self.schedule, self.trace = optimum(task.system, packets, period, steps)
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Do nothing; the policy has no memory."""
@@ -124,13 +126,7 @@ class PeriodicOptimum:
         return np.ascontiguousarray(self.schedule[place].T)
 
 
-def optimum(
-    system: System[Any],
-    packets: int,
-    period: int,
-    cache: str | None = None,
-    steps: int | None = None,
-) -> Schedule:
+def optimum(system: System[Any], packets: int, period: int, steps: int | None = None) -> Schedule:
     """Return the schedule with the smallest trace, from the cache if it is known.
 
     Of equal traces (to a relative 1e-9) the first schedule in the order of steps and sensors wins.
@@ -139,18 +135,14 @@ def optimum(
         system: declares a ``covariance_cycle``.
         packets: requests of all sensors in a period.
         period: number of steps of the schedule.
-        cache: path of a file of schedules; None for none.
         steps: number of steps of the mean from the start; None for the steady state.
 
     Raises:
         ConfigurationError: the system's covariances depend on the data.
     """
-    key = schedule_key(system, packets, period, steps)
+    key = hashlib.sha256(pickle.dumps((system, packets, period, steps))).hexdigest()
     if key not in _cache:
-        stored = load_schedule(cache, key, packets, (period, system.sensor_count))
-        _cache[key] = _search(system, packets, period, steps) if stored is None else stored
-    if cache is not None:
-        store_schedule(cache, key, _cache[key])
+        _cache[key] = _search(system, packets, period, steps)
     return _cache[key]
 
 

@@ -129,6 +129,11 @@ class PricedThreshold(BeliefRule):
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
+        result: Requests = self.log_ratio(signals) >= 0.0
+        return result
+
+    def log_ratio(self, signals: Signals) -> Array:
+        """Return ln r - k ln max{1, s (p/p0)^μ} (sensors, N); a request is at least 0."""
         value, loss = self._scores(signals)
         numbers, bucket, age = self.numbers, self.task.bucket, np.maximum(signals["age"], 0.0)
         price = signals["price"] if self.price is None else np.asarray(self.price)
@@ -140,14 +145,13 @@ class PricedThreshold(BeliefRule):
         least = least * ((age + 1.0) / 6.0) ** numbers.age_exponent
         value, loss = np.maximum(value, 0.0), np.maximum(loss, 0.0)
         score = value ** (1.0 - numbers.mixture) * loss**numbers.mixture
-        requests = (value > 0.0) & (score >= least)
+        ratio = np.where(value > 0.0, score / np.maximum(least, 1e-300), 0.0)
         margin = np.maximum(numbers.margin * price**numbers.margin_exponent, 1.0)
-        if np.all(margin == 1.0):
-            return requests
-        ratio = np.where(requests, score / np.maximum(least, 1e-300), 0.0)
-        rank = np.argsort(np.lexsort((-age, -ratio), axis=0), axis=0)
-        result: Requests = requests & (score >= least * margin**rank)
-        return result
+        if not np.all(margin == 1.0):
+            rank = np.argsort(np.lexsort((-age, -ratio), axis=0), axis=0)
+            ratio = np.where(value > 0.0, score / np.maximum(least * margin**rank, 1e-300), 0.0)
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(ratio))
 
     def _scores(self, signals: Signals) -> tuple[Array, Array]:
         """Return the two scores v (sensors, N) and l (…, N)."""
