@@ -203,7 +203,7 @@ def test_a_random_walk_becomes_a_stable_plant() -> None:
 @pytest.mark.parametrize(("rows", "share"), [(100, 0.5), (4000, 0.02)])
 def test_too_few_readings_are_refused(rows: int, share: float) -> None:
     with pytest.raises(
-        ConfigurationError, match=r"recording = .c0. is not allowed: .* at least 200"
+        ConfigurationError, match=r"readings of c0 in the fitted part = .* must be .* >= 200"
     ):
         fit(recording(simulate(rows)), share)
 

@@ -283,7 +283,7 @@ def test_parameters_come_from_the_text_then_the_scenario_then_the_trigger() -> N
     assert policy.decay == 0.4
     assert policy.scale == 1.0
     plain: Any = make_rule("dynamic_event")
-    assert (plain.threshold, plain.divisor) == ((0.1, 0.2, 0.3), 5.0)
+    assert (plain.threshold, plain.divisor) == (0.2, 5.0)
 
 
 @pytest.mark.parametrize("name", policy_names("rule"))

@@ -19,5 +19,5 @@ print(env.reset(seed=0)[0])
 task = fusion_gym.make_task("mine/Rooms-v0")
 for name in ("periodic:period=6", "innovation_threshold:threshold=0.5"):
     policy = fusion_gym.make_policy(name, task)
-    results = fusion_gym.evaluation.run_episodes(task, policy, episodes=100, seed=0)
+    results = fusion_gym.evaluation.run_episodes(task, policy)
     print(name, results.rate.mean(), results.mse.mean())

@@ -9,7 +9,7 @@ task = fusion_gym.make_task(card["env"], **card["options"])
 
 def run(name):
     policy = fusion_gym.make_policy(name, task)
-    return fusion_gym.evaluation.run_episodes(task, policy, episodes=100, seed=0)
+    return fusion_gym.evaluation.run_episodes(task, policy)
 
 
 thresholds = [f"innovation_threshold:threshold={value:.2f}" for value in np.geomspace(0.5, 3, 10)]
