@@ -172,7 +172,7 @@ def levels(recording: Recording, share: float) -> tuple[Array, int, Array]:
     result, removed = np.empty(values.shape), np.zeros((values.shape[1], 5))
     for place, column in enumerate(values.to_numpy().T):
         present = np.flatnonzero(np.isfinite(column[:rows]))
-        first = np.linalg.lstsq(known[present], column[present])[0]
+        first = np.linalg.pinv(known[present]) @ column[present]
         result[:, place] = column - known @ first
         removed[place, : len(first)] = first
     return result, rows, removed
@@ -343,7 +343,7 @@ def _fit(recording: Recording, values: Array, order: int, exact: bool) -> Fitted
                 f"readings with those before, and {_LEAST * count * order} must"
             )
         now, lags = now[complete], lags[complete]
-        coefficients = np.linalg.lstsq(lags, now)[0].T
+        coefficients = (np.linalg.pinv(lags) @ now).T
         residuals = now - lags @ coefficients.T
         process = residuals.T @ residuals / (len(now) - np.linalg.matrix_rank(lags))
     else:
