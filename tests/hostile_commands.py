@@ -46,6 +46,13 @@ BASES: dict[str, dict[str, list[str]]] = {
         "config": ["training.yaml"], "sweep": ["sweep.yaml"], "policy": ["always"],
         "output": ["made"], "episodes": ["2"],
     },
+    "calibrate": {
+        "env": [ENV], "policy": ["zoo:tobit_oscillator_scheduler"], "output": ["made.zip"],
+        "set": [
+            "filter=tobit", "random_start=true", "token_rate=2", "memory=true",
+            "cost_weight=random", "price_range=[0.01513,2.353]",
+        ],
+    },
     "fit": {"log": ["log.csv"], "output": ["made.yaml"], "channels": ["a"], "share": ["0.5"]},
     "field": {"log": ["log.csv"], "output": ["made"], "channels": ["a"], "share": ["0.5"]},
     "list": {"kinds": ["rules"]},

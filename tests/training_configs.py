@@ -26,6 +26,7 @@ def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
         "algorithm": SMALL[kind],
         "training": {"timesteps": 1024, "num_envs": 8},
         "validation": {"every": 512, "episodes": 4},
+        "calibration": None,
         "output": str(folder / "run"),
     }
     if TABLE[kind].discrete_only:

@@ -52,6 +52,7 @@ LISTED = (
     Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
+    Listed("fusion-gym calibrate ", "needs a training of minutes"),
     Listed("fusion-gym search ", "minutes", "--generations 1"),
     Listed("fusion-gym field ", "minutes"),
     Listed("tensorboard ", "serves until it is interrupted"),

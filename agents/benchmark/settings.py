@@ -133,6 +133,7 @@ class Suite(Strict):
                 error=setting.error,
             ),
             validation=ValidationConfig(every=max(timesteps // 3, 1), episodes=256),
+            calibration=None,
             output="agent",
         )
 

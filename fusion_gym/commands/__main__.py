@@ -12,8 +12,8 @@ from fusion_gym.validation import ConfigurationError, choice
 from fusion_gym.version import __version__
 
 COMMANDS = (
-    "compare", "demo", "evaluate", "export", "field", "fit", "info", "list", "search", "train",
-    "watch",
+    "calibrate", "compare", "demo", "evaluate", "export", "field", "fit", "info", "list", "search",
+    "train", "watch",
 )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ class Demo(Long):
             Compare(
                 config=str(agent / "config.yaml"),
                 sweep="scale_free_sweep",
-                policy=f"model:{agent / 'best_model.zip'}",
+                policy=f"model:{agent / 'calibrated_model.zip'}",
                 prices=7,
                 episodes=self.episodes,
                 output=folder / "comparison",

@@ -194,6 +194,15 @@ class RuleSearch:
         start = zip(self.coordinates, limits, strict=True)
         return np.array([np.clip(values.get(name, 0.0), *ends) for name, ends in start])
 
+    def rule(self, point: Array) -> str:
+        """Return the rule of a point (coordinates,) as text."""
+        settings = {"reference_price": self.reference_price, **self.numbers(point[None])._asdict()}
+        texts = (
+            f"{name}={'/'.join(f'{value:.5g}' for value in np.ravel(column))}"
+            for name, column in settings.items()
+        )
+        return ",".join((self.text, *texts))
+
     def numbers(self, points: Array) -> ThresholdNumbers:
         """Return the numbers (…, K) of K points (K, coordinates)."""
         names = np.array(self.coordinates)
@@ -305,12 +314,7 @@ def search_result(search: RuleSearch, generations: Sequence[Generation]) -> Sear
     if not generations:
         raise validation.refusal("generations", generations, "one or more")
     mean = np.mean([item.mean for item in generations[len(generations) // 2 :]], axis=0)
-    settings = {"reference_price": search.reference_price, **search.numbers(mean[None])._asdict()}
-    texts = (
-        f"{name}={'/'.join(f'{value:.5g}' for value in np.ravel(column))}"
-        for name, column in settings.items()
-    )
-    policy = ",".join((search.text, *texts))
+    policy = search.rule(mean)
     episodes = 4 * search.episodes[1]
     seed = search.seed + (2 + search.generations) * search.episodes[1]
     rule: Any = make_policy(policy, search.task)

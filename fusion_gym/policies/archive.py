@@ -37,7 +37,7 @@ class NeedsTrust(ConfigurationError):
 
 def read_plain(file: Path) -> dict[str, Any]:
     """Return the archive's ``data``, with pickled entries as text."""
-    content = _part(file, "data")
+    content = read_part(file, "data")
     try:
         data = json.loads(content)
     except (ValueError, RecursionError):
@@ -49,7 +49,7 @@ def read_plain(file: Path) -> dict[str, Any]:
 
 def read_weights(file: Path) -> dict[str, torch.Tensor]:
     """Return the policy's weights by name, finite float32."""
-    content = io.BytesIO(_part(file, "policy.pth"))
+    content = io.BytesIO(read_part(file, "policy.pth"))
     try:
         with zipfile.ZipFile(content) as parts:
             listed = parts.infolist()
@@ -72,7 +72,7 @@ def read_weights(file: Path) -> dict[str, torch.Tensor]:
     return {str(name): weight for name, weight in data.items()}
 
 
-def _part(file: Path, name: str) -> bytes:
+def read_part(file: Path, name: str) -> bytes:
     """Return a part of the archive, up to its declared size."""
     try:
         with zipfile.ZipFile(file) as archive:

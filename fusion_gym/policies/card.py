@@ -28,7 +28,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.views import make_view
 from fusion_gym.policies.archive import NeedsTrust
 from fusion_gym.policies.network import NetworkShape
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, display
 
 ENTRY = "fusion_gym_model"
 FORMAT = 1
@@ -98,7 +98,11 @@ class ModelView:
 
     def on(self, task: Task) -> Task:
         """Return the task with the price and the scale of the model's training."""
-        if self.price_range is not None and task.reward.price.span is None:
+        span = task.reward.price.span
+        if None not in (self.price_range, span) and self.price_range != span:
+            allowed = f"{display(self.price_range)}, which the agent observes, or left out"
+            raise validation.refusal("price_range", span, allowed)
+        if self.price_range is not None and span is None:
             price = Price(None, self.price_range)
             task = replace(task, reward=replace(task.reward, price=price))
         error, own = self.nominal_error, task.nominal_error

@@ -52,9 +52,7 @@ def load_model_policy(
             cannot rebuild (without ``trust``), or another observation layout or action space.
     """
     validation.boolean("deterministic", deterministic)
-    file = next((p for p in (Path(path), Path(f"{path}.zip")) if p.is_file()), None)
-    if file is None:
-        raise ConfigurationError(f"model {path!r} is not allowed: there is no such file")
+    file = model_file(path)
     try:
         data = read_plain(file)
         observed = ModelView.read(data)
@@ -69,6 +67,14 @@ def load_model_policy(
         raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
     task = dataclasses.replace(task, action=action)
     return ModelPolicy(model, task, deterministic, price, observed)
+
+
+def model_file(path: str) -> Path:
+    """Return the file of an agent, with or without ``.zip`` in its path."""
+    file = next((p for p in (Path(path), Path(f"{path}.zip")) if p.is_file()), None)
+    if file is None:
+        raise ConfigurationError(f"model {path!r} is not allowed: there is no such file")
+    return file
 
 
 def _rebuilt(

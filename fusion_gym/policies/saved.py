@@ -2,6 +2,7 @@
 
 from fusion_gym import zoo
 from fusion_gym.core.task import Task
+from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.policies.base import Policy
 
 
@@ -13,7 +14,7 @@ def saved_agent(
     *,
     trust: bool = False,
 ) -> Policy:
-    """Request by a Stable-Baselines3 agent from a file.
+    """Request by a Stable-Baselines3 agent, or by calibrated agents, from a file.
 
     Args:
         task: the task; a text cannot set it.
@@ -25,9 +26,17 @@ def saved_agent(
     Raises:
         ConfigurationError: as :func:`fusion_gym.policies.loading.load_model_policy`.
     """
-    from fusion_gym.policies.loading import load_model_policy
+    from fusion_gym.policies.calibrated import holds_calibration, load_calibrated
+    from fusion_gym.policies.loading import load_model_policy, model_file
 
-    return load_model_policy(path, task, deterministic, price, trust=trust)
+    if not holds_calibration(file := model_file(path)):
+        return load_model_policy(path, task, deterministic, price, trust=trust)
+    if not deterministic:
+        raise refusal("deterministic", deterministic, "true for calibrated agents")
+    try:
+        return load_calibrated(file, task, price, trust)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
 
 
 def zoo_agent(

@@ -62,19 +62,31 @@ class ValidationConfig(Strict):
     seed: int = pydantic.Field(default=500_000_000, ge=0)
 
 
+class CalibrationConfig(Strict):
+    """Calibration after a training at drawn prices: tuning episodes of the first and last round."""
+
+    episodes: tuple[Positive, Positive] = (16, 400)
+
+
 class Experiment(Strict):
-    """One training: environment, algorithm, length, validation and output folder."""
+    """One training: environment, algorithm, length, validation, calibration and output folder."""
 
     environment: EnvironmentConfig
     algorithm: AnyAlgorithm
     training: TrainingConfig
     validation: ValidationConfig = ValidationConfig()
+    calibration: CalibrationConfig | None = CalibrationConfig()
     output: str = pydantic.Field(min_length=1, pattern=r"^[^\n\t]+$")
 
     def inputs(self) -> dict[str, Any]:
         """Return the inputs that determine the results, without length, folder and threads."""
         return self.model_dump(
-            mode="json", exclude={"output": True, "training": {"timesteps": True, "threads": True}}
+            mode="json",
+            exclude={
+                "output": True,
+                "calibration": True,
+                "training": {"timesteps": True, "threads": True},
+            },
         )
 
     def resolved(self, settings: Mapping[str, Any], sensors: int) -> Experiment:

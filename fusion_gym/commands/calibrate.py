@@ -1,0 +1,112 @@
+r"""Calibrate agents with a rule at each price of a token, without training.
+
+    fusion-gym calibrate --config runs/front/config.yaml \
+        --policy model:runs/front/best_model.zip --output calibrated.zip
+
+At each price the command mixes agent and rule, and sets the threshold of a request, by the cost of
+tuning episodes. The rule alone stays unless another candidate is cheaper by two standard errors. Of
+several agents the best one is taken at each price. The file is a policy:
+``model:calibrated.zip,price=0.1``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Annotated
+
+from rich.table import Table
+
+from fusion_gym import zoo
+from fusion_gym.commands.command_line import EnvironmentOptions, Long, PolicyNames
+from fusion_gym.commands.options import OutputFile, Whole
+from fusion_gym.commands.search import token_prices
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.output import tables
+from fusion_gym.output.files import replacing
+from fusion_gym.output.progress import progress_bar, writing
+from fusion_gym.policies.calibrated import save_calibrated
+from fusion_gym.policies.loading import model_file
+from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.rules.priced_threshold import PricedThreshold
+from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate, start_rule
+from fusion_gym.training.environment import environment_of
+from fusion_gym.validation import ConfigurationError, refusal
+
+
+@dataclass(frozen=True)
+class Calibrate(EnvironmentOptions, Long):
+    """Calibrate agents with a rule at each price of a token, without training."""
+
+    policy: PolicyNames
+    """Agents that observe the price: model:PATH or zoo:NAME."""
+    output: Annotated[Path, OutputFile(".zip")]
+    """The file of the calibrated policy."""
+    rule: str | None = None
+    """Text of a priced_threshold, as search prints it; by default the start of a search."""
+    prices: Annotated[int, Whole(2, 100)] = 5
+    """Number of prices of a token, from the lowest to the highest."""
+    episodes: Annotated[int, Whole(2, 100_000)] = EPISODES[1]
+    """Tuning episodes of the last round."""
+
+    keeps = False
+
+    def run(self) -> None:
+        """Calibrate, write the policy and print a row for each price."""
+        env_id, options, _ = environment_of(self.env, self.config, self.options)
+        task = make_task(env_id, **options)
+        if task.reward.price.span is None:
+            raise refusal("price_range", None, "the range of prices that the agents observe")
+        names = list(dict.fromkeys(chain(*self.policy)))
+        agents = [agent_of(name, task) for name in names]
+        prices = token_prices(env_id, options, task, self.prices)
+        text = self.rule or start_rule(task, agents[0].view.rows_per_run > 1, prices)
+        try:
+            rule = make_policy(text, task)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"rule = {text!r} is not allowed: {error}") from None
+        if not isinstance(rule, PricedThreshold):
+            raise refusal("rule", text, "a priced_threshold")
+        writing(("the calibrated policy", self.output))
+        with progress_bar(len(prices), "calibrating", unit="prices") as bar:
+            episodes = EPISODES[0], self.episodes
+            policy, rows = calibrate(task, agents, rule, prices, episodes, progress=bar.update)
+        models = [Path(_path(name)).read_bytes() for name in names]
+        with replacing(self.output) as partial:
+            save_calibrated(policy, text, models, partial)
+        tables.console().print(calibration_table(env_id, rows))
+
+
+def agent_of(name: str, task: Task) -> ModelPolicy:
+    """Return the agent of a text, which names no price."""
+    agent = make_policy(name, task)
+    if not isinstance(agent, ModelPolicy) or "," in name:
+        raise refusal("policy", name, "model:PATH or zoo:NAME, an agent without settings")
+    return agent
+
+
+def _path(name: str) -> str:
+    kind, _, rest = name.partition(":")
+    return zoo.model_path(rest) if kind == "zoo" else str(model_file(rest))
+
+
+def calibration_table(env_id: str, rows: Sequence[CalibrationRow]) -> Table:
+    """Return the table of the calibration at each price."""
+    cells = [
+        (
+            f"{row.point.price:.4g}",
+            f"{row.point.agent}",
+            f"{row.point.mixture:g}",
+            f"{row.point.threshold:g}",
+            f"{row.cost:.4g}",
+            f"{row.cost / row.rule_cost - 1.0:+.1%}",
+            f"{row.agent_cost / row.rule_cost - 1.0:+.1%}",
+        )
+        for row in rows
+    ]
+    title = f"{env_id}: costs of tuning episodes; relative to the rule, negative: cheaper"
+    heads = ("price", "agent", "mixture", "threshold", "cost", "relative", "agent alone")
+    note = "mixture 1 with threshold 0 is the rule, 0 with 0 the agent's likeliest action"
+    return tables.table_tables(title, heads, cells, note)

@@ -1,0 +1,199 @@
+"""Agents calibrated with a rule: both ends of the mixture, the choice, and the file."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import DQN, PPO
+from training_configs import small_config
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.policy_batch import run_priced
+from fusion_gym.policies.calibrated import (
+    CalibratedPolicy,
+    CalibrationPoint,
+    request_logits,
+    save_calibrated,
+)
+from fusion_gym.policies.card import ModelView
+from fusion_gym.policies.model import ModelPolicy, tag_model
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.calibration import _choice, _Slopes, calibrate, start_rule
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.run import train
+from fusion_gym.validation import ConfigurationError
+
+LINEAR = "fusion_gym/LinearFusion-v2"
+OPTIONS: dict[str, Any] = {
+    "horizon": 25, "memory": True, "cost_weight": "random", "price_range": (0.05, 2.0),
+    "reward_scale": None,
+}  # fmt: skip
+RULE = "priced_threshold:own={own},reference_price=0.3,threshold=0.2,margin={margin}"
+
+
+def made(kind: Any = PPO, local: bool = False, **options: Any) -> tuple[Task, ModelPolicy, Any]:
+    """A task, an untrained agent and a rule of the same class."""
+    task = fusion_gym.make_task(LINEAR, **OPTIONS | options)
+    envs = fusion_gym.make_sb3_vec_env(LINEAR, 2, local=local, **OPTIONS | options)
+    model = kind("MlpPolicy", envs, seed=3)
+    tag_model(model, task, local)
+    own, margin = ("true", 1) if local else ("false", 1.7)
+    rule = make_policy(RULE.format(own=own, margin=margin), task)
+    return task, ModelPolicy(model, task, trained=ModelView(local=local)), rule
+
+
+def requests(task: Task, policy: Any, episodes: int = 30) -> Any:
+    return run_episodes(task, policy, episodes, 0)
+
+
+KINDS: list[tuple[Any, bool, dict[str, Any]]] = [
+    (PPO, False, {}),
+    (PPO, True, {}),
+    (PPO, False, {"access": "single"}),
+    (MaskablePPO, False, {}),
+]
+
+
+@pytest.mark.parametrize(("kind", "local", "options"), KINDS)
+def test_the_ends_of_the_mixture_are_the_rule_and_the_agent(
+    kind: Any, local: bool, options: dict[str, Any]
+) -> None:
+    """The rule bit by bit, with its margin; the agent by its likeliest action."""
+    task, agent, rule = made(kind, local, **options)
+    for mixture, end in ((1.0, rule), (0.0, agent)):
+        point = CalibrationPoint(0.3, 0, mixture, 0.0)
+        ours = requests(task, CalibratedPolicy(task, [agent], [0.7], rule, [point]))
+        theirs = requests(task, end)
+        np.testing.assert_array_equal(ours.returns, theirs.returns)
+        if kind is PPO and not options:
+            np.testing.assert_array_equal(ours.requests, theirs.requests)
+            assert 0.0 < ours.requests.mean() < 1.0
+
+
+def test_between_two_prices_the_numbers_are_linear_in_the_logarithm() -> None:
+    task, agent, rule = made()
+    points = [CalibrationPoint(0.1, 0, 0.5, -0.3), CalibrationPoint(1.6, 1, 1.0, 0.1)]
+    policy = CalibratedPolicy(task, [agent, agent], [1.0, 2.0], rule, points)
+    number, mixture, threshold = policy.at(np.array([0.01, 0.2, 0.4, 0.8, 9.0]))
+    np.testing.assert_allclose(mixture, [0.5, 0.625, 0.75, 0.875, 1.0])
+    np.testing.assert_allclose(threshold, [-0.3, -0.2, -0.1, 0.0, 0.1], atol=1e-12)
+    assert [*number[:2], *number[3:]] == [0, 0, 1, 1]
+
+
+def test_the_slope_is_the_regression_of_logits_on_log_ratios() -> None:
+    task, agent, rule = made()
+    recorder = _Slopes(rule, [agent])
+    logits, ratios = [], []
+
+    class Recorder(_Slopes):
+        def __call__(self, signals: Any) -> Any:
+            ratio = rule.log_ratio(signals)
+            ratios.append(ratio[np.isfinite(ratio)])
+            logits.append(request_logits(agent, signals)[np.isfinite(ratio)])
+            return super().__call__(signals)
+
+    recorder = Recorder(rule, [agent])
+    requests(task, recorder)
+    slope = np.polyfit(np.concatenate(ratios), np.concatenate(logits), 1)[0]
+    spread = np.concatenate(logits).std() / np.concatenate(ratios).std()
+    assert recorder.slopes() == pytest.approx([slope if slope > 0.0 else spread])
+
+
+def test_a_hopeless_agent_leaves_the_rule_and_a_bad_rule_is_mended() -> None:
+    """At fresh episodes a rule that sends far too often is cheaper by a higher threshold."""
+    task, agent, _ = made()
+    prices = (0.05, 0.3, 2.0)
+    text = start_rule(task, False, prices)
+    best: Any = make_policy(text, task)
+    policy, rows = calibrate(task, [agent], best, prices, (8, 100))
+    assert all(row.cost <= row.rule_cost for row in rows)
+    assert all(point.mixture == 1.0 for point in policy.points)
+    bad: Any = make_policy(RULE.format(own="false", margin=1).replace("0.2", "0.02"), task)
+    policy, rows = calibrate(task, [agent], bad, prices, (8, 100))
+    assert any(point.threshold > 0.0 for point in policy.points)
+    seeds, every = np.tile(np.arange(200), 3), np.repeat(prices, 200)
+    ours, theirs = (
+        run_priced(task, item, seeds, every).cost(every).mean() for item in (policy, bad)
+    )
+    assert ours < 0.97 * theirs
+
+
+def test_of_several_agents_a_price_has_the_best() -> None:
+    """The second agent is the rule itself, spoiled at its highest price for the first."""
+    task, agent, rule = made()
+    policy, rows = calibrate(task, [agent, agent], rule, (0.05, 2.0), (4, 20))
+    assert len(policy.points) == len(rows) == 2
+    assert {point.agent for point in policy.points} <= {0, 1}
+
+
+def test_a_file_is_the_policy(tmp_path: Path) -> None:
+    task, agent, rule = made()
+    agent.model.save(tmp_path / "agent.zip")
+    model = (tmp_path / "agent.zip").read_bytes()
+    points = [CalibrationPoint(0.05, 0, 0.0, -0.2), CalibrationPoint(2.0, 0, 0.5, 0.1)]
+    policy = CalibratedPolicy(task, [agent], [0.3], rule, points)
+    text = RULE.format(own="false", margin=1.7)
+    save_calibrated(policy, text, [model], tmp_path / "policy.zip")
+    again = make_policy(f"model:{tmp_path / 'policy.zip'}", task)
+    np.testing.assert_array_equal(requests(task, again).returns, requests(task, policy).returns)
+    fixed = fusion_gym.make_task(LINEAR, **OPTIONS | {"cost_weight": 0.4, "price_range": None})
+    priced = make_policy(f"model:{tmp_path / 'policy.zip'},price=0.4", fixed)
+    prices = np.full(30, 0.4)
+    theirs = run_priced(task, policy, np.arange(30), prices)
+    np.testing.assert_allclose(requests(fixed, priced).tokens, theirs.tokens)
+    (tmp_path / "policy.zip").write_bytes((tmp_path / "policy.zip").read_bytes()[:-40])
+    with pytest.raises(ConfigurationError, match=r"model .* is not allowed"):
+        make_policy(f"model:{tmp_path / 'policy.zip'}", task)
+
+
+def test_agents_without_a_logit_a_sensor_are_refused() -> None:
+    task, _, rule = made()
+    for kind in (DQN, PPO):
+        envs = fusion_gym.make_sb3_vec_env(LINEAR, 2, **OPTIONS, action="discrete")
+        discrete = fusion_gym.make_task(LINEAR, **OPTIONS, action="discrete")
+        agent = ModelPolicy(kind("MlpPolicy", envs, seed=0), discrete)
+        with pytest.raises(ConfigurationError, match="is not allowed: it must be"):
+            CalibratedPolicy(task, [agent], [1.0], rule, [CalibrationPoint(0.3, 0, 0.0, 0.0)])
+
+
+def test_a_training_ends_with_a_calibrated_model(tmp_path: Path) -> None:
+    environment = {"id": LINEAR, "options": OPTIONS | {"price_range": [0.05, 2.0]}}
+    changes = {"environment": environment, "calibration": {"episodes": [2, 8]}}
+    experiment = load_checked(Experiment, small_config(tmp_path, **changes))
+    train(experiment, quiet=True)
+    task = fusion_gym.make_task(LINEAR, **environment["options"])
+    policy: Any = make_policy(f"model:{tmp_path / 'run' / 'calibrated_model.zip'}", task)
+    assert [point.price for point in policy.points] == pytest.approx(np.geomspace(0.05, 2.0, 5))
+
+
+@pytest.mark.parametrize("threshold", [-0.4, 0.6])
+def test_a_mixture_weighs_the_logit_over_its_slope_and_the_log_ratio(threshold: float) -> None:
+    task, agent, rule = made()
+    point = CalibrationPoint(0.3, 0, 0.3, threshold)
+    policy = CalibratedPolicy(task, [agent], [0.2], rule, [point])
+    batch = EpisodeBatch.seeded(task, 200, 0)
+    for _ in range(6):
+        signals = batch.signals()
+        z, logit = rule.log_ratio(signals), request_logits(agent, signals)
+        expected = 0.7 * logit / 0.2 + 0.3 * z >= threshold
+        np.testing.assert_array_equal(policy(signals), expected)
+        assert 0.0 < expected.mean() < 1.0
+        batch.step(expected)
+
+
+@pytest.mark.parametrize(("gain", "chosen"), [(0.1, 0.0), (0.3, 0.8)])
+def test_the_rule_stays_within_two_standard_errors(gain: float, chosen: float) -> None:
+    """A hundred episodes whose difference has the deviation 1, so a standard error of .1."""
+    noise = np.random.default_rng(0).normal(size=100)
+    noise = (noise - noise.mean()) / noise.std(ddof=1)
+    candidates = [(0, 1.0, 0.0), (0, 0.0, 0.0), (0, 0.5, 0.8)]
+    costs = np.array([np.full(100, 5.0), np.full(100, 7.0), 5.0 - gain + noise])
+    row = _choice(0.3, candidates, costs, 1)
+    assert (row.point.threshold, row.rule_cost, row.agent_cost) == (chosen, 5.0, 7.0)
+    assert row.cost == pytest.approx(5.0 - gain if chosen else 5.0)
