@@ -197,3 +197,23 @@ def test_the_rule_stays_within_two_standard_errors(gain: float, chosen: float) -
     row = _choice(0.3, candidates, costs, 1)
     assert (row.point.threshold, row.rule_cost, row.agent_cost) == (chosen, 5.0, 7.0)
     assert row.cost == pytest.approx(5.0 - gain if chosen else 5.0)
+
+
+@pytest.mark.parametrize(("kind", "local", "options"), KINDS)
+def test_an_agent_without_the_rule_has_its_threshold_in_its_network(
+    kind: Any, local: bool, options: dict[str, Any]
+) -> None:
+    _, agent, rule = made(kind, local, **options)
+    fixed = fusion_gym.make_task(
+        LINEAR, **OPTIONS | options | {"cost_weight": 0.3, "price_range": None}
+    )
+    own = ModelPolicy(agent.model, fixed, price=0.3, trained=ModelView(None, local, (0.05, 2.0)))
+    points = [CalibrationPoint(0.3, 0, 0.0, 0.4)]
+    policy = CalibratedPolicy(fixed, [own], [0.2], rule, points, 0.3)
+    single = policy.single_agent()
+    ours, theirs = (requests(fixed, item).returns for item in (single, policy))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+    assert (ours != requests(fixed, own).returns).any()
+    mixed = CalibratedPolicy(fixed, [own], [0.2], rule, [CalibrationPoint(0.3, 0, 0.5, 0.4)], 0.3)
+    with pytest.raises(ConfigurationError, match=r"mixture = 0.5 is not allowed: .* rule reads"):
+        mixed.single_agent()

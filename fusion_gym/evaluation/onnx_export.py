@@ -7,6 +7,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.onnx_check import Agreement, Latency, latency, onnx_agreement
 from fusion_gym.importing import require
 from fusion_gym.policies.base import Policy
+from fusion_gym.policies.calibrated import CalibratedPolicy
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.onnx_card import onnx_card
 from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes, save_graph
@@ -53,6 +54,8 @@ def export_onnx(
         OSError: the file cannot be written.
     """
     require("onnx", "onnx", "onnx", "onnxruntime")
+    if isinstance(agent, CalibratedPolicy):
+        agent = agent.single_agent()
     if not isinstance(agent, ModelPolicy):
         raise refusal("agent", agent, "a saved agent, zoo:NAME or model:PATH")
     path, graph = Path(path), DecisionGraph(agent)

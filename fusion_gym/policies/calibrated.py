@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import tempfile
 import zipfile
@@ -128,6 +129,29 @@ class CalibratedPolicy:
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Do nothing; the policy has no memory."""
+
+    def single_agent(self) -> ModelPolicy:
+        """Return the agent at the policy's price, with the threshold in its last layer.
+
+        Raises:
+            ConfigurationError: no price, or a price at which the rule takes part.
+        """
+        if self.price is None:
+            raise validation.refusal("price", None, "a number: model:PATH,price=…")
+        (number,), (mixture,), (threshold,) = self.at(np.array([self.price]))
+        if mixture > 0.0:
+            why = f"0 at the price {self.price:g}: the rule reads signals that a file does not have"
+            raise validation.refusal("mixture", float(mixture), why)
+        agent = copy.deepcopy(self.agents[number])
+        bias: Any = agent.model.policy.action_net.bias
+        places = slice(None)
+        if isinstance(agent.view.actions, spaces.Discrete):
+            places = slice(1, None)
+        elif isinstance(agent.model, MaskablePPO):
+            places = slice(1, None, 2)
+        with torch.no_grad():
+            bias[places] -= float(threshold) * self.slopes[number]
+        return agent
 
     def at(self, price: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Return agent, μ and c (N,) at prices (N,)."""
