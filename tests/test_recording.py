@@ -319,6 +319,25 @@ def test_formats_of_the_same_log_have_the_same_values(name: str, tmp_path: Path)
     assert recording.channels == expected.channels
 
 
+def test_times_of_two_zones_are_one_clock(tmp_path: Path) -> None:
+    """A log over the end of summer time, whose offset changes."""
+    table = log()
+    zones = np.where(np.arange(60) < 30, "+02:00", "+01:00")
+    local = pd.to_datetime(table["time"]) + pd.to_timedelta(np.where(zones == "+02:00", 2, 1), "h")
+    recording = read(table.assign(time=local.astype(str) + zones), tmp_path)
+    assert recording.interval == pd.Timedelta("10min")
+    assert str(recording.values.index[0]) == "2026-03-01 00:00:00"
+    assert len(recording.values) == 60
+
+
+def test_a_wrong_time_is_named(tmp_path: Path) -> None:
+    times = log()["time"].where(np.arange(60) < 59, "2926-01-01 00:00:00")
+    with pytest.raises(ConfigurationError, match=r"2926-01-01 00:00:00.* too many for its 60 rows"):
+        read(log(time=times), tmp_path)
+    with pytest.raises(ConfigurationError, match="it must be the path of a CSV file"):
+        Recording.read(3)  # type: ignore[arg-type]
+
+
 def test_seconds_are_times(tmp_path: Path) -> None:
     recording = read(log(time=np.arange(60) * 30 + 1.7e9), tmp_path)
     assert recording.interval == pd.Timedelta("30s")
