@@ -157,6 +157,7 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
         content = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())
         content["environment"]["options"] |= {"horizon": 10, "price_range": [0.01, 1.0]}
         content["training"]["num_envs"] = content["validation"]["episodes"] = 16
+        content["calibration"] = {"episodes": [2, 4]}
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
         monkeypatch.setitem(demo.CONFIGS, name, str(tmp_path / f"{name}.yaml"))
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "256"]

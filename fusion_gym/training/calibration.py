@@ -93,10 +93,13 @@ class _Slopes:
         return [float(value) for value in np.maximum(slope, _LEAST)]
 
 
-def start_rule(task: Task, local: bool, prices: Sequence[float]) -> str:
+def start_rule(
+    task: Task, local: bool, prices: Sequence[float], episodes: tuple[int, int] = EPISODES
+) -> str:
     """Return the rule with which a search of the agents' class begins, as text."""
     name: ClassName = "centre" if task.information == "centre" else "scheduler"
-    search = search_of_class("local" if local else name, task, prices)
+    count = episodes[0], max(1, episodes[1] // 4)
+    search = search_of_class("local" if local else name, task, prices, episodes=count)
     return search.rule(search.first_point())
 
 

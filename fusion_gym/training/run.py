@@ -172,9 +172,10 @@ def _calibrate(experiment: Experiment, folder: Path, task: Task, prices: tuple[f
         check_logits(agent)
     except ConfigurationError:
         return
-    text = start_rule(task, experiment.environment.local, prices)
+    episodes = experiment.calibration.episodes
+    text = start_rule(task, experiment.environment.local, prices, episodes)
     rule: Any = make_policy(text, task)
-    policy, _ = calibrate(task, [agent], rule, prices, experiment.calibration.episodes)
+    policy, _ = calibrate(task, [agent], rule, prices, episodes)
     with replacing(folder / "calibrated_model.zip") as partial:
         save_calibrated(policy, text, [file.read_bytes()], partial)
 
