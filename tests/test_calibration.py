@@ -23,7 +23,7 @@ from fusion_gym.policies.calibrated import (
 from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.training.calibration import _choice, _Slopes, calibrate, start_rule
+from fusion_gym.training.calibration import _choice, _Recorder, calibrate, start_rule
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import train
@@ -88,20 +88,12 @@ def test_between_two_prices_the_numbers_are_linear_in_the_logarithm() -> None:
 
 def test_the_slope_is_the_regression_of_logits_on_log_ratios() -> None:
     task, agent, rule = made()
-    recorder = _Slopes(rule, [agent])
-    logits, ratios = [], []
-
-    class Recorder(_Slopes):
-        def __call__(self, signals: Any) -> Any:
-            ratio = rule.log_ratio(signals)
-            ratios.append(ratio[np.isfinite(ratio)])
-            logits.append(request_logits(agent, signals)[np.isfinite(ratio)])
-            return super().__call__(signals)
-
-    recorder = Recorder(rule, [agent])
+    recorder = _Recorder(rule, [agent])
     requests(task, recorder)
-    slope = np.polyfit(np.concatenate(ratios), np.concatenate(logits), 1)[0]
-    spread = np.concatenate(logits).std() / np.concatenate(ratios).std()
+    z, logit = np.concatenate(recorder.samples, axis=1)
+    some = np.isfinite(z)
+    slope = np.polyfit(z[some], logit[some], 1)[0]
+    spread = logit[some].std() / z[some].std()
     assert recorder.slopes() == pytest.approx([slope if slope > 0.0 else spread])
 
 

@@ -21,19 +21,13 @@ from fusion_gym import zoo
 from fusion_gym.commands.command_line import EnvironmentOptions, Long, PolicyNames
 from fusion_gym.commands.options import OutputFile, Whole
 from fusion_gym.commands.search import token_prices
-from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output import tables
-from fusion_gym.output.files import replacing
-from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.policies.calibrated import save_calibrated
+from fusion_gym.output.progress import progress_bar
 from fusion_gym.policies.loading import model_file
-from fusion_gym.policies.model import ModelPolicy
-from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.priced_threshold import PricedThreshold
-from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate, start_rule
+from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate_files
 from fusion_gym.training.environment import environment_of
-from fusion_gym.validation import ConfigurationError, refusal
+from fusion_gym.validation import refusal
 
 
 @dataclass(frozen=True)
@@ -59,37 +53,23 @@ class Calibrate(EnvironmentOptions, Long):
         task = make_task(env_id, **options)
         if task.reward.price.span is None:
             raise refusal("price_range", None, "the range of prices that the agents observe")
-        names = list(dict.fromkeys(chain(*self.policy)))
-        agents = [agent_of(name, task) for name in names]
+        files = [agent_file(name) for name in dict.fromkeys(chain(*self.policy))]
         prices = token_prices(env_id, options, task, self.prices)
-        text = self.rule or start_rule(task, agents[0].view.rows_per_run > 1, prices)
-        try:
-            rule = make_policy(text, task)
-        except ConfigurationError as error:
-            raise ConfigurationError(f"rule = {text!r} is not allowed: {error}") from None
-        if not isinstance(rule, PricedThreshold):
-            raise refusal("rule", text, "a priced_threshold")
-        writing(("the calibrated policy", self.output))
+        episodes = EPISODES[0], self.episodes
         with progress_bar(len(prices), "calibrating", unit="prices") as bar:
-            episodes = EPISODES[0], self.episodes
-            policy, rows = calibrate(task, agents, rule, prices, episodes, progress=bar.update)
-        models = [Path(_path(name)).read_bytes() for name in names]
-        with replacing(self.output) as partial:
-            save_calibrated(policy, text, models, partial)
+            rows = calibrate_files(
+                task, files, prices, episodes, self.output, self.rule, bar.update
+            )
         tables.console().print(calibration_table(env_id, rows))
+        print(f"model:{self.output}")
 
 
-def agent_of(name: str, task: Task) -> ModelPolicy:
-    """Return the agent of a text, which names no price."""
-    agent = make_policy(name, task)
-    if not isinstance(agent, ModelPolicy) or "," in name:
-        raise refusal("policy", name, "model:PATH or zoo:NAME, an agent without settings")
-    return agent
-
-
-def _path(name: str) -> str:
+def agent_file(name: str) -> Path:
+    """Return the file of an agent's text, which has no settings."""
     kind, _, rest = name.partition(":")
-    return zoo.model_path(rest) if kind == "zoo" else str(model_file(rest))
+    if kind not in ("model", "zoo") or "," in rest:
+        raise refusal("policy", name, "model:PATH or zoo:NAME, an agent without settings")
+    return model_file(zoo.model_path(rest) if kind == "zoo" else rest)
 
 
 def calibration_table(env_id: str, rows: Sequence[CalibrationRow]) -> Table:

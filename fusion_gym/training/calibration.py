@@ -6,6 +6,7 @@ The rule stays unless another candidate is cheaper by two standard errors.
 """
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +17,20 @@ from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.policy_batch import run_priced
 from fusion_gym.evaluation.rule_search import ClassName, search_of_class
+from fusion_gym.output.files import replacing
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.calibrated import CalibratedPolicy, CalibrationPoint, request_logits
+from fusion_gym.policies.calibrated import (
+    CalibratedPolicy,
+    CalibrationPoint,
+    check_logits,
+    request_logits,
+    save_calibrated,
+)
+from fusion_gym.policies.loading import load_model_policy
 from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.priced_threshold import PricedThreshold
+from fusion_gym.validation import refusal
 
 MIXTURES = 0.0, 0.5, 1.0
 THRESHOLDS = -2.4, -0.8, -0.3, -0.1, 0.1, 0.3, 0.8
@@ -60,14 +71,14 @@ class _Trial(CalibratedPolicy):
         return agent, mixture, threshold
 
 
-class _Slopes:
-    """The rule as a policy that adds up the moments of each agent's logits and its log ratio."""
+class _Recorder:
+    """The rule as a policy, which records its log ratios and the agents' logits."""
+
+    knowledge: Knowledge = KNOWLEDGE[-1]
 
     def __init__(self, rule: PricedThreshold, agents: Sequence[ModelPolicy]) -> None:
-        self.rule, self.agents = rule, agents
-        self.knowledge: Knowledge = KNOWLEDGE[-1]
+        self.rule, self.agents, self.samples = rule, agents, list[Array]()
         self.memory_owner = agents[0].memory_owner or rule.memory_owner
-        self.moments = np.zeros((len(agents), 6))
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Do nothing; the rule has no memory."""
@@ -75,22 +86,21 @@ class _Slopes:
     def __call__(self, signals: Signals) -> Requests:
         """Return the rule's requests."""
         ratio = self.rule.log_ratio(signals)
-        for moments, agent in zip(self.moments, self.agents, strict=True):
-            logit = request_logits(agent, signals)
-            finite = np.isfinite(ratio) & np.isfinite(logit)
-            z, logit = ratio[finite], logit[finite]
-            sums = [len(z), z.sum(), logit.sum(), z @ z, z @ logit, logit @ logit]
-            moments += np.array(sums)
+        logits = (request_logits(agent, signals) for agent in self.agents)
+        self.samples.append(np.stack([ratio, *logits]).reshape(1 + len(self.agents), -1))
         requests: Requests = ratio >= 0.0
         return requests
 
     def slopes(self) -> list[float]:
         """Return each agent's slope of its logit on z; without one, the ratio of deviations."""
-        z, logit, zz, both, logits = (self.moments / np.maximum(self.moments[:, :1], 1.0)).T[1:]
-        spread, cross = zz - z * z, both - z * logit
-        other = np.sqrt(np.maximum(logits - logit * logit, 0.0) / np.maximum(spread, _LEAST))
-        slope = np.where(cross > _LEAST * spread, cross / np.maximum(spread, _LEAST), other)
-        return [float(value) for value in np.maximum(slope, _LEAST)]
+        z, *every = np.concatenate(self.samples, axis=1)
+        result = []
+        for logit in every:
+            some = np.isfinite(z) & np.isfinite(logit)
+            (variance, cross), (_, own) = np.cov(z[some], logit[some])
+            slope = cross if cross > _LEAST * variance else np.sqrt(own * variance)
+            result.append(max(float(slope / max(variance, _LEAST)), _LEAST))
+        return result
 
 
 def start_rule(
@@ -101,6 +111,42 @@ def start_rule(
     count = episodes[0], max(1, episodes[1] // 4)
     search = search_of_class("local" if local else name, task, prices, episodes=count)
     return search.rule(search.first_point())
+
+
+def calibrate_files(
+    task: Task,
+    files: Sequence[Path],
+    prices: Sequence[float],
+    episodes: tuple[int, int],
+    output: Path,
+    rule: str | None = None,
+    progress: Callable[[int], Any] | None = None,
+) -> list[CalibrationRow]:
+    """Calibrate the agents of files, write the policy and return a row for each price.
+
+    Args:
+        task: the task, whose price is drawn.
+        files: the agents.
+        prices: prices of a token in increasing order.
+        episodes: tuning episodes of all candidates, and of the last round.
+        output: the file to write.
+        rule: text of a priced_threshold; by default the start of a search.
+        progress: function that receives 1 after each price.
+
+    Raises:
+        ConfigurationError: an agent without one logit for each sensor, or a rule of another kind.
+    """
+    agents = [load_model_policy(str(file), task) for file in files]
+    for agent in agents:
+        check_logits(agent)
+    text = rule or start_rule(task, agents[0].view.rows_per_run > 1, prices, episodes)
+    if not text.startswith("priced_threshold"):
+        raise refusal("rule", text, "a priced_threshold")
+    made: Any = make_policy(text, task)
+    policy, rows = calibrate(task, agents, made, prices, episodes, progress=progress)
+    with replacing(output) as partial:
+        save_calibrated(policy, text, [file.read_bytes() for file in files], partial)
+    return rows
 
 
 def calibrate(
@@ -123,7 +169,7 @@ def calibrate(
         seed: seed of the first tuning episode.
         progress: function that receives 1 after each price.
     """
-    recorder = _Slopes(rule, agents)
+    recorder = _Recorder(rule, agents)
     first, last = episodes
     run_priced(
         task, recorder, seed + np.tile(np.arange(first), len(prices)), np.repeat(prices, first)
@@ -152,15 +198,13 @@ def calibrate(
 
 def _choice(price: float, some: Sequence[Candidate], costs: Array, agents: int) -> CalibrationRow:
     """Return the cheapest candidate if it is cheaper than the rule, the first, beyond doubt."""
-    best = int(costs.mean(1).argmin())
-    difference = costs[best] - costs[0]
-    error = difference.std(ddof=1) / np.sqrt(len(difference)) if len(difference) > 1 else np.inf
-    chosen = best if difference.mean() + ERRORS * error < 0.0 else 0
-    agent, mixture, threshold = some[chosen]
     means = costs.mean(1)
-    point = CalibrationPoint(float(price), agent, mixture, threshold)
-    agent_cost = float(means[1 : 1 + agents].min())
-    return CalibrationRow(point, float(means[chosen]), float(means[0]), agent_cost)
+    best = int(means.argmin())
+    difference = costs[best] - costs[0]
+    error = difference.std(ddof=1) / np.sqrt(len(difference))
+    chosen = best if difference.mean() + ERRORS * error < 0.0 else 0
+    point = CalibrationPoint(float(price), *some[chosen])
+    return CalibrationRow(point, means[chosen], means[0], means[1 : 1 + agents].min())
 
 
 def _costs(

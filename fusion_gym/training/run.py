@@ -1,5 +1,6 @@
 """One training from config to summary, which can be interrupted and resumed."""
 
+import contextlib
 import time
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,7 @@ from fusion_gym.importing import trust_files
 from fusion_gym.output.files import replacing, write, write_text
 from fusion_gym.output.folders import check_inputs, fingerprint, lock_folder
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.policies.calibrated import check_logits, save_calibrated
-from fusion_gym.policies.loading import load_model_policy
-from fusion_gym.policies.registry import make_policy
-from fusion_gym.training.calibration import calibrate, start_rule
+from fusion_gym.training.calibration import calibrate_files
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.checkpoint import Journal, read_journal, restore
 from fusion_gym.training.config import Experiment
@@ -147,7 +145,10 @@ def _learn(
                 model.save(partial)
             if experiment.calibration is not None and len(progress.prices) > 1:
                 bar.say("calibrating")
-                _calibrate(experiment, folder, scored, progress.prices)
+                episodes, files = experiment.calibration.episodes, [folder / "best_model.zip"]
+                with contextlib.suppress(ConfigurationError):  # an agent of another kind
+                    output = folder / "calibrated_model.zip"
+                    calibrate_files(scored, files, progress.prices, episodes, output)
     best = min(journal.records, key=lambda record: record["relative_cost"], default=None)
     summary = {
         "timesteps": model.num_timesteps,
@@ -161,23 +162,6 @@ def _learn(
     if not quiet:
         print(describe(summary, folder, time.perf_counter() - began))
     return summary
-
-
-def _calibrate(experiment: Experiment, folder: Path, task: Task, prices: tuple[float, ...]) -> None:
-    """Write the calibrated policy of the best model, if it has one logit for each sensor."""
-    assert experiment.calibration is not None
-    file = folder / "best_model.zip"
-    agent = load_model_policy(str(file), task, trust=True)
-    try:
-        check_logits(agent)
-    except ConfigurationError:
-        return
-    episodes = experiment.calibration.episodes
-    text = start_rule(task, experiment.environment.local, prices, episodes)
-    rule: Any = make_policy(text, task)
-    policy, _ = calibrate(task, [agent], rule, prices, episodes)
-    with replacing(folder / "calibrated_model.zip") as partial:
-        save_calibrated(policy, text, [file.read_bytes()], partial)
 
 
 def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
