@@ -1,5 +1,7 @@
 """Agents calibrated with a rule: both ends of the mixture, the choice, and the file."""
 
+import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +143,34 @@ def test_a_file_is_the_policy(tmp_path: Path) -> None:
     np.testing.assert_allclose(requests(fixed, priced).tokens, theirs.tokens)
     (tmp_path / "policy.zip").write_bytes((tmp_path / "policy.zip").read_bytes()[:-40])
     with pytest.raises(ConfigurationError, match=r"model .* is not allowed"):
+        make_policy(f"model:{tmp_path / 'policy.zip'}", task)
+
+
+POINT = {"price": 0.3, "agent": 0, "mixture": 0.0, "threshold": 0.0}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"points": []},
+        {"points": [POINT, POINT]},
+        {"points": [POINT | {"agent": 1}]},
+        {"points": [POINT | {"threshold": float("nan")}]},
+        {"points": [{"price": 0.3}]},
+        {"slopes": []},
+        {"slopes": [-1.0]},
+        {"rule": "os:system"},
+    ],
+)
+def test_a_file_with_other_content_is_refused(tmp_path: Path, content: Any) -> None:
+    """In one line, and no rule of a file runs code."""
+    task, agent, _ = made()
+    agent.model.save(tmp_path / "agent.zip")
+    right = {"points": [POINT], "slopes": [1.0], "rule": RULE.format(own="false", margin=1)}
+    with zipfile.ZipFile(tmp_path / "policy.zip", "w") as archive:
+        archive.writestr("calibration.json", json.dumps(right | content))
+        archive.write(tmp_path / "agent.zip", "agent_0.zip")
+    with pytest.raises(ConfigurationError, match="its calibration cannot be read"):
         make_policy(f"model:{tmp_path / 'policy.zip'}", task)
 
 

@@ -225,9 +225,12 @@ def load_calibrated(path: Path, task: Task, price: float | None, trust: bool) ->
         slopes, text = [float(slope) for slope in content["slopes"]], str(content["rule"])
         numbers = np.array([list(asdict(point).values()) for point in points], dtype=np.float64)
         sound = np.isfinite(numbers).all() and (np.diff(numbers[:, 0]) > 0.0).all()
-        if not (sound and min(slopes) > 0.0 and set(numbers[:, 1]) <= set(range(len(slopes)))):
+        known = set(numbers[:, 1]) <= set(range(len(slopes)))
+        if not (sound and known and 0.0 < min(slopes) <= max(slopes) < np.inf):
             raise ValueError("its numbers are not allowed")
-    except (KeyError, TypeError, ValueError) as error:
+        if text.partition(":")[0] != "priced_threshold":  # another name may run code
+            raise ValueError(f"its rule {text!r} is no priced_threshold")
+    except (LookupError, TypeError, ValueError) as error:
         raise ConfigurationError(f"its calibration cannot be read: {error}") from None
     agents = []
     with tempfile.TemporaryDirectory() as folder:
