@@ -208,6 +208,19 @@ def test_too_few_readings_are_refused(rows: int, share: float) -> None:
         fit(recording(simulate(rows)), share)
 
 
+@pytest.mark.parametrize("share", [0.0, -0.1, 0.96])
+def test_a_share_beyond_the_log_is_refused(share: float) -> None:
+    with pytest.raises(ConfigurationError, match=f"share = {share} is not allowed"):
+        fit(recording(simulate(1000)), share)
+
+
+def test_a_channel_that_hardly_changes_is_refused() -> None:
+    path = simulate(1000)
+    path[:, 1] *= 1e-9
+    with pytest.raises(ConfigurationError, match=r"deviation of c1 = .* >= 1e-06"):
+        fit(recording(path))
+
+
 def test_the_mast_has_errors_near_the_models() -> None:
     own = Recording.read("mast").select()
     plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)

@@ -363,3 +363,14 @@ def test_a_fork_of_a_process_that_has_run_jax_is_refused() -> None:
         line.startswith("JAX may hang in a fork") and "'spawn'" in line for line in lines[:3]
     )
     assert lines[3] == "(3, 3)"
+
+
+def test_parameters_of_linearfusion_are_the_ones_that_it_has() -> None:
+    """A filter without nodes has no shares of information."""
+    for kind, shares in (("kalman", [0.5, 0.5]), ("adf", None)):
+        _, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", filter=kind)
+        np.testing.assert_array_equal(params.measurement_variance, [[0.25], [0.25]])
+        if shares is None:
+            assert params.information_shares is None
+        else:
+            np.testing.assert_array_equal(params.information_shares, shares)

@@ -277,10 +277,11 @@ def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
         ({"true_process_noise": 2.0}, "the truth is the recording"),
         ({"backend": "jax"}, "under JAX"),
         ({"fit_share": 1.0}, "fit_share = 1.0"),
+        ({"log": 3}, "^log = 3 is not allowed"),
     ]
     for options, message in cases:
         with pytest.raises(ConfigurationError, match=message):
-            fusion_gym.make_task(ENV, log=log, **{"tokens": "unlimited"} | plant | options)
+            fusion_gym.make_task(ENV, **{"log": log, "tokens": "unlimited"} | plant | options)
     with pytest.raises(
         ConfigurationError, match=r"source = 'resampled' is not allowed: .* and 100 must"
     ):
