@@ -6,6 +6,8 @@
 The config's ``output`` folder receives ``config.yaml``, ``latest.zip`` (the checkpoint),
 ``best_model.zip`` (the least validation cost relative to single thresholds),
 ``validation.jsonl`` and ``tensorboard/``, and at the end ``final_model.zip`` and ``summary.json``.
+A training at drawn prices also writes ``calibrated_model.zip``, if the agent has one logit for each
+sensor.
 
 The command writes a checkpoint after every validation. Ctrl-C and SIGTERM end the training after
 the current rollout with a checkpoint; a second Ctrl-C ends it at once, without one. ``--resume``

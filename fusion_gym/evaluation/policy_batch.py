@@ -132,7 +132,7 @@ class Together:
         """Return the requests (sensors, N)."""
         whole = _Whole(signals)
         each = zip(self._decisions, self.parts, strict=True)
-        return np.concatenate([decide(whole.part(part)) for decide, part in each], axis=-1)
+        return np.concatenate([decision(whole.part(part)) for decision, part in each], axis=-1)
 
 
 class _Whole:

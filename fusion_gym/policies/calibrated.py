@@ -49,12 +49,12 @@ class CalibrationPoint:
 def check_logits(agent: ModelPolicy) -> None:
     """Refuse an agent without one logit for each sensor."""
     model, actions = agent.model, agent.view.actions
-    one = isinstance(actions, spaces.MultiBinary) or agent.view.rows_per_run > 1
+    separate = isinstance(actions, spaces.MultiBinary) or agent.view.rows_per_run > 1
     kinds = ActorCriticPolicy, MaskableActorCriticPolicy
     if not isinstance(model.policy, kinds) or isinstance(model, RecurrentPPO):
         allowed = "an agent with one logit for each sensor (ppo, a2c, trpo, maskable_ppo)"
         raise validation.refusal("policy", type(model).__name__, allowed)
-    if not one and agent.task.access != "single":
+    if not separate and agent.task.access != "single":
         raise validation.refusal("action", str(actions), "MultiBinary, or access='single'")
 
 

@@ -142,8 +142,8 @@ def calibrate_files(
     text = rule or start_rule(task, agents[0].view.rows_per_run > 1, prices, episodes)
     if not text.startswith("priced_threshold"):
         raise refusal("rule", text, "a priced_threshold")
-    made: Any = make_policy(text, task)
-    policy, rows = calibrate(task, agents, made, prices, episodes, progress=progress)
+    threshold_rule: Any = make_policy(text, task)
+    policy, rows = calibrate(task, agents, threshold_rule, prices, episodes, progress=progress)
     with replacing(output) as partial:
         save_calibrated(policy, text, [file.read_bytes() for file in files], partial)
     return rows
@@ -184,26 +184,28 @@ def calibrate(
     ]
     rows = []
     for price in prices:
-        every = [_RULE, *own, *grid]
-        costs = _costs(trial, every, price, first, seed).mean(1)
-        order = [every[place] for place in np.argsort(costs, kind="stable")]
-        some = list(dict.fromkeys([_RULE, *own, *order[: BEST + 1 + len(own)]]))
-        results = _costs(trial, some, price, last, seed + first)
-        rows.append(_choice(price, some, results, len(own)))
+        candidates = [_RULE, *own, *grid]
+        costs = _costs(trial, candidates, price, first, seed).mean(1)
+        order = [candidates[place] for place in np.argsort(costs, kind="stable")]
+        finalists = list(dict.fromkeys([_RULE, *own, *order[: BEST + 1 + len(own)]]))
+        results = _costs(trial, finalists, price, last, seed + first)
+        rows.append(_choice(price, finalists, results, len(own)))
         if progress is not None:
             progress(1)
     points = [row.point for row in rows]
     return CalibratedPolicy(task, agents, trial.slopes, rule, points), rows
 
 
-def _choice(price: float, some: Sequence[Candidate], costs: Array, agents: int) -> CalibrationRow:
+def _choice(
+    price: float, finalists: Sequence[Candidate], costs: Array, agents: int
+) -> CalibrationRow:
     """Return the cheapest candidate if it is cheaper than the rule, the first, beyond doubt."""
     means = costs.mean(1)
     best = int(means.argmin())
     difference = costs[best] - costs[0]
     error = difference.std(ddof=1) / np.sqrt(len(difference))
     chosen = best if difference.mean() + ERRORS * error < 0.0 else 0
-    point = CalibrationPoint(float(price), *some[chosen])
+    point = CalibrationPoint(float(price), *finalists[chosen])
     return CalibrationRow(point, means[chosen], means[0], means[1 : 1 + agents].min())
 
 
