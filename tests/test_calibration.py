@@ -19,13 +19,13 @@ from fusion_gym.evaluation.policy_batch import run_priced
 from fusion_gym.policies.calibrated import (
     CalibratedPolicy,
     CalibrationPoint,
-    request_logits,
     save_calibrated,
 )
 from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.training.calibration import _choice, _Recorder, calibrate, start_rule
+from fusion_gym.training import run
+from fusion_gym.training.calibration import SEED, _choice, calibrate, fit_slopes
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import train
@@ -57,6 +57,7 @@ def requests(task: Task, policy: Any, episodes: int = 30) -> Any:
 KINDS: list[tuple[Any, bool, dict[str, Any]]] = [
     (PPO, False, {}),
     (PPO, True, {}),
+    (PPO, True, {"memory": False}),
     (PPO, False, {"access": "single"}),
     (MaskablePPO, False, {}),
 ]
@@ -90,50 +91,67 @@ def test_between_two_prices_the_numbers_are_linear_in_the_logarithm() -> None:
 
 def test_the_slope_is_the_regression_of_logits_on_log_ratios() -> None:
     task, agent, rule = made()
-    recorder = _Recorder(rule, [agent])
-    requests(task, recorder)
-    z, logit = np.concatenate(recorder.samples, axis=1)
+    slopes = fit_slopes(CalibratedPolicy(task, [agent], (), rule, ()), [0.3], 30)
+    batch, samples = EpisodeBatch.seeded(task, 30, SEED), []
+    batch.price = np.full(30, 0.3)
+    for _ in range(task.horizon):
+        signals = batch.signals()
+        samples.append([rule.log_ratio(signals), agent.logits(signals)])
+        batch.step(rule(signals))
+    z, logit = np.array(samples).swapaxes(0, 1).reshape(2, -1)
     some = np.isfinite(z)
     slope = np.polyfit(z[some], logit[some], 1)[0]
     spread = logit[some].std() / z[some].std()
-    assert recorder.slopes() == pytest.approx([slope if slope > 0.0 else spread])
+    assert slopes == pytest.approx([slope if slope > 0.0 else spread])
 
 
-def test_a_hopeless_agent_leaves_the_rule_and_a_bad_rule_is_mended() -> None:
+def saved(agent: ModelPolicy, folder: Path) -> Path:
+    agent.model.save(folder / "agent.zip")
+    return folder / "agent.zip"
+
+
+def test_a_hopeless_agent_leaves_the_rule_and_a_bad_rule_is_mended(tmp_path: Path) -> None:
     """At fresh episodes a rule that sends far too often is cheaper by a higher threshold."""
     task, agent, _ = made()
-    prices = (0.05, 0.3, 2.0)
-    text = start_rule(task, False, prices)
-    best: Any = make_policy(text, task)
-    policy, rows = calibrate(task, [agent], best, prices, (8, 100))
+    prices, episodes, output = (0.05, 0.3, 2.0), (8, 100), tmp_path / "policy.zip"
+    files = [saved(agent, tmp_path)]
+    rows = calibrate(task, files, prices, episodes, output)
     assert all(row.cost <= row.rule_cost for row in rows)
-    assert all(point.mixture == 1.0 for point in policy.points)
-    bad: Any = make_policy(RULE.format(own="false", margin=1).replace("0.2", "0.02"), task)
-    policy, rows = calibrate(task, [agent], bad, prices, (8, 100))
-    assert any(point.threshold > 0.0 for point in policy.points)
+    assert all(row.point.mixture == 1.0 for row in rows)
+    bad = RULE.format(own="false", margin=1).replace("0.2", "0.02")
+    rows = calibrate(task, files, prices, episodes, output, bad)
+    assert any(row.point.threshold > 0.0 for row in rows)
     seeds, every = np.tile(np.arange(200), 3), np.repeat(prices, 200)
     ours, theirs = (
-        run_priced(task, item, seeds, every).cost(every).mean() for item in (policy, bad)
+        run_priced(task, make_policy(text, task), seeds, every).cost(every).mean()
+        for text in (f"model:{output}", bad)
     )
     assert ours < 0.97 * theirs
 
 
-def test_of_several_agents_a_price_has_the_best() -> None:
-    """The second agent is the rule itself, spoiled at its highest price for the first."""
-    task, agent, rule = made()
-    policy, rows = calibrate(task, [agent, agent], rule, (0.05, 2.0), (4, 20))
-    assert len(policy.points) == len(rows) == 2
+def test_of_several_agents_a_price_has_the_best(tmp_path: Path) -> None:
+    task, agent, _ = made()
+    files, output = [saved(agent, tmp_path)] * 2, tmp_path / "policy.zip"
+    text = RULE.format(own="false", margin=1)
+    rows = calibrate(task, files, (0.05, 2.0), (4, 20), output, text)
+    policy: Any = make_policy(f"model:{output}", task)
+    assert policy.points == [row.point for row in rows]
     assert {point.agent for point in policy.points} <= {0, 1}
+
+
+@pytest.mark.parametrize("rule", ["os:system", "always", "priced_threshold_other:threshold=1"])
+def test_a_rule_of_another_kind_is_refused(tmp_path: Path, rule: str) -> None:
+    task, agent, _ = made()
+    with pytest.raises(ConfigurationError, match=r"rule = .* must be a priced_threshold"):
+        calibrate(task, [saved(agent, tmp_path)], (0.05, 2.0), (2, 4), tmp_path / "o.zip", rule)
 
 
 def test_a_file_is_the_policy(tmp_path: Path) -> None:
     task, agent, rule = made()
-    agent.model.save(tmp_path / "agent.zip")
-    model = (tmp_path / "agent.zip").read_bytes()
     points = [CalibrationPoint(0.05, 0, 0.0, -0.2), CalibrationPoint(2.0, 0, 0.5, 0.1)]
     policy = CalibratedPolicy(task, [agent], [0.3], rule, points)
     text = RULE.format(own="false", margin=1.7)
-    save_calibrated(policy, text, [model], tmp_path / "policy.zip")
+    save_calibrated(text, [0.3], points, [saved(agent, tmp_path)], tmp_path / "policy.zip")
     again = make_policy(f"model:{tmp_path / 'policy.zip'}", task)
     np.testing.assert_array_equal(requests(task, again).returns, requests(task, policy).returns)
     fixed = fusion_gym.make_task(LINEAR, **OPTIONS | {"cost_weight": 0.4, "price_range": None})
@@ -165,11 +183,10 @@ POINT = {"price": 0.3, "agent": 0, "mixture": 0.0, "threshold": 0.0}
 def test_a_file_with_other_content_is_refused(tmp_path: Path, content: Any) -> None:
     """In one line, and no rule of a file runs code."""
     task, agent, _ = made()
-    agent.model.save(tmp_path / "agent.zip")
     right = {"points": [POINT], "slopes": [1.0], "rule": RULE.format(own="false", margin=1)}
     with zipfile.ZipFile(tmp_path / "policy.zip", "w") as archive:
         archive.writestr("calibration.json", json.dumps(right | content))
-        archive.write(tmp_path / "agent.zip", "agent_0.zip")
+        archive.write(saved(agent, tmp_path), "agent_0.zip")
     with pytest.raises(ConfigurationError, match="its calibration cannot be read"):
         make_policy(f"model:{tmp_path / 'policy.zip'}", task)
 
@@ -184,14 +201,41 @@ def test_agents_without_a_logit_a_sensor_are_refused() -> None:
             CalibratedPolicy(task, [agent], [1.0], rule, [CalibrationPoint(0.3, 0, 0.0, 0.0)])
 
 
+def trained(folder: Path, kind: str = "ppo", quiet: bool = True, **options: Any) -> Path:
+    """The file that a short training at drawn prices may calibrate."""
+    options = OPTIONS | {"price_range": [0.05, 2.0]} | options
+    changes = {
+        "environment": {"id": LINEAR, "options": options},
+        "calibration": {"episodes": [2, 8]},
+    }
+    experiment = load_checked(Experiment, small_config(folder, kind, **changes))
+    train(experiment, quiet=quiet)
+    return folder / "run" / "calibrated_model.zip"
+
+
 def test_a_training_ends_with_a_calibrated_model(tmp_path: Path) -> None:
-    environment = {"id": LINEAR, "options": OPTIONS | {"price_range": [0.05, 2.0]}}
-    changes = {"environment": environment, "calibration": {"episodes": [2, 8]}}
-    experiment = load_checked(Experiment, small_config(tmp_path, **changes))
-    train(experiment, quiet=True)
-    task = fusion_gym.make_task(LINEAR, **environment["options"])
-    policy: Any = make_policy(f"model:{tmp_path / 'run' / 'calibrated_model.zip'}", task)
+    file, task = trained(tmp_path), fusion_gym.make_task(LINEAR, **OPTIONS)
+    policy: Any = make_policy(f"model:{file}", task)
     assert [point.price for point in policy.points] == pytest.approx(np.geomspace(0.05, 2.0, 5))
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_training_without_a_logit_a_sensor_tells_so(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], quiet: bool
+) -> None:
+    assert not trained(tmp_path, "dqn", quiet, action="discrete").exists()
+    assert ("no calibrated model: policy = 'DQN'" in capfd.readouterr().err) is not quiet
+
+
+def test_a_failed_calibration_ends_the_training_with_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise ConfigurationError("a failure")
+
+    monkeypatch.setattr(run, "calibrate", fail)
+    with pytest.raises(ConfigurationError, match="a failure"):
+        trained(tmp_path)
 
 
 @pytest.mark.parametrize("threshold", [-0.4, 0.6])
@@ -202,7 +246,7 @@ def test_a_mixture_weighs_the_logit_over_its_slope_and_the_log_ratio(threshold: 
     batch = EpisodeBatch.seeded(task, 200, 0)
     for _ in range(6):
         signals = batch.signals()
-        z, logit = rule.log_ratio(signals), request_logits(agent, signals)
+        z, logit = rule.log_ratio(signals), agent.logits(signals)
         expected = 0.7 * logit / 0.2 + 0.3 * z >= threshold
         np.testing.assert_array_equal(policy(signals), expected)
         assert 0.0 < expected.mean() < 1.0

@@ -23,9 +23,8 @@ from fusion_gym.commands.options import OutputFile, Whole
 from fusion_gym.commands.search import token_prices
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output import tables
-from fusion_gym.output.progress import progress_bar
 from fusion_gym.policies.loading import model_file
-from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate_files
+from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate
 from fusion_gym.training.environment import environment_of
 from fusion_gym.validation import refusal
 
@@ -56,10 +55,7 @@ class Calibrate(EnvironmentOptions, Long):
         files = [agent_file(name) for name in dict.fromkeys(chain(*self.policy))]
         prices = token_prices(env_id, options, task, self.prices)
         episodes = EPISODES[0], self.episodes
-        with progress_bar(len(prices), "calibrating", unit="prices") as bar:
-            rows = calibrate_files(
-                task, files, prices, episodes, self.output, self.rule, bar.update
-            )
+        rows = calibrate(task, files, prices, episodes, self.output, self.rule)
         tables.console().print(calibration_table(env_id, rows))
         print(f"model:{self.output}")
 
@@ -74,18 +70,11 @@ def agent_file(name: str) -> Path:
 
 def calibration_table(env_id: str, rows: Sequence[CalibrationRow]) -> Table:
     """Return the table of the calibration at each price."""
-    cells = [
-        (
-            f"{row.point.price:.4g}",
-            f"{row.point.agent}",
-            f"{row.point.mixture:g}",
-            f"{row.point.threshold:g}",
-            f"{row.cost:.4g}",
-            f"{row.cost / row.rule_cost - 1.0:+.1%}",
-            f"{row.agent_cost / row.rule_cost - 1.0:+.1%}",
-        )
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        relative = row.cost / row.rule_cost - 1.0, row.agent_cost / row.rule_cost - 1.0
+        numbers = [f"{number:.4g}" for number in (*row.point, row.cost)]
+        cells.append([*numbers, *(f"{share:+.1%}" for share in relative)])
     title = f"{env_id}: costs of tuning episodes; relative to the rule, negative: cheaper"
     heads = ("price", "agent", "mixture", "threshold", "cost", "relative", "agent alone")
     note = "mixture 1 with threshold 0 is the rule, 0 with 0 the agent's likeliest action"

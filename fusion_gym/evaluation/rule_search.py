@@ -214,6 +214,13 @@ class RuleSearch:
         return ThresholdNumbers(**columns)
 
 
+def class_of(task: Task, local: bool) -> ClassName:
+    """Return the class of the agents of a task, of which local ones decide by themselves."""
+    if local:
+        return "local"
+    return "centre" if task.information == "centre" else "scheduler"
+
+
 def search_of_class(
     name: ClassName, task: Task, prices: Sequence[float], **options: Any
 ) -> RuleSearch:

@@ -3,26 +3,17 @@
 ``fusion-gym calibrate`` writes the file, an archive of ``calibration.json`` and the agents.
 """
 
-from __future__ import annotations
-
-import copy
 import json
 import tempfile
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
-from sb3_contrib import MaskablePPO, RecurrentPPO
-from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
-from stable_baselines3.common.policies import ActorCriticPolicy
 
-from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Signals, least_covering
 from fusion_gym.core.task import Task
@@ -30,14 +21,16 @@ from fusion_gym.policies.archive import read_part
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.loading import load_model_policy
 from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.priced_threshold import PricedThreshold
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 CALIBRATION = "calibration.json"  # the part of the archive that marks a calibrated policy
 
+Mixing = tuple[NDArray[np.int64], Array, Array]  # agent, μ and c of each run (N,)
 
-@dataclass(frozen=True)
-class CalibrationPoint:
+
+class CalibrationPoint(NamedTuple):
     """The calibration at a price: the agent's number, the mixture μ and the threshold c."""
 
     price: float
@@ -46,36 +39,15 @@ class CalibrationPoint:
     threshold: float
 
 
-def check_logits(agent: ModelPolicy) -> None:
-    """Refuse an agent without one logit for each sensor."""
-    model, actions = agent.model, agent.view.actions
-    separate = isinstance(actions, spaces.MultiBinary) or agent.view.rows_per_run > 1
-    kinds = ActorCriticPolicy, MaskableActorCriticPolicy
-    if not isinstance(model.policy, kinds) or isinstance(model, RecurrentPPO):
-        allowed = "an agent with one logit for each sensor (ppo, a2c, trpo, maskable_ppo)"
-        raise validation.refusal("policy", type(model).__name__, allowed)
-    if not separate and agent.task.access != "single":
-        raise validation.refusal("action", str(actions), "MultiBinary, or access='single'")
+def calibration_rule(text: str, task: Task) -> PricedThreshold:
+    """Return the rule of a text, which may name no other policy, because that may run code."""
+    if text.partition(":")[0] != "priced_threshold":
+        raise refusal("rule", text, "a priced_threshold")
+    rule: Any = make_policy(text, task)
+    return rule
 
 
-def request_logits(agent: ModelPolicy, signals: Signals) -> Array:
-    """Return the logit (sensors, N) of each sensor's request over its silence."""
-    policy: Any = agent.model.policy
-    rows = torch.as_tensor(agent.rows(signals))
-    with torch.no_grad():
-        latent = policy.mlp_extractor.forward_actor(policy.extract_features(rows))
-        values: Array = policy.action_net(latent).numpy().astype(np.float64)
-    if agent.view.rows_per_run > 1:
-        values = (values[:, 1] - values[:, 0]).reshape(-1, agent.view.rows_per_run)
-    elif isinstance(agent.view.actions, spaces.Discrete):
-        values = values[:, 1:] - values[:, :1]
-    elif isinstance(agent.model, MaskablePPO):
-        values = values[:, 1::2] - values[:, ::2]
-    if isinstance(agent.model, MaskablePPO):
-        values = np.where(signals["grantable"].T, values, -np.inf)
-    return np.ascontiguousarray(values.T)
-
-
+@dataclass(eq=False)
 class CalibratedPolicy:
     r"""Request where a mixture of an agent's logit and a rule's log ratio reaches a threshold.
 
@@ -100,32 +72,28 @@ class CalibratedPolicy:
         μ = 1 and c = 0 is the rule, μ = 0 and c = 0 the agent's likeliest action.
     """
 
+    task: Task
+    agents: Sequence[ModelPolicy]
+    slopes: Sequence[float]
+    rule: PricedThreshold
+    points: Sequence[CalibrationPoint]
+    price: float | None = None
     deterministic, stateless = True, True
 
-    def __init__(
-        self,
-        task: Task,
-        agents: Sequence[ModelPolicy],
-        slopes: Sequence[float],
-        rule: PricedThreshold,
-        points: Sequence[CalibrationPoint],
-        price: float | None = None,
-    ) -> None:
-        for agent in agents:
-            check_logits(agent)
-        owners = {item.memory_owner or "scheduler" for item in agents}
-        if rule.memory_owner is not None:
-            owners.add(rule.memory_owner)
-        if len(owners) != 1:
+    def __post_init__(self) -> None:
+        for agent in self.agents:
+            agent.check_logits()
+        owners = {*(agent.memory_owner for agent in self.agents), self.rule.memory_owner} - {None}
+        if any(agent.view.rows_per_run == 1 for agent in self.agents):
+            owners.add("scheduler")
+        if len(owners) > 1:
             raise ConfigurationError(
-                f"rule = {rule!r} is not allowed with these agents: all must use the beliefs of "
-                f"one owner, not of {sorted(owners)}"
+                f"rule = {self.rule!r} is not allowed with these agents: all must use the beliefs "
+                f"of one owner, not of {sorted(map(str, owners))}"
             )
-        self.task, self.agents, self.slopes, self.rule = task, tuple(agents), tuple(slopes), rule
-        self.points, self.price, self.view = tuple(points), price, agents[0].view
-        self.memory_owner = agents[0].memory_owner or rule.memory_owner
-        classes = [agent.knowledge for agent in agents]
-        self.knowledge = least_covering([*classes, rule.knowledge])
+        self.memory_owner = self.agents[0].memory_owner or self.rule.memory_owner
+        classes = [agent.knowledge for agent in self.agents]
+        self.knowledge = least_covering([*classes, self.rule.knowledge])
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Do nothing; the policy has no memory."""
@@ -137,32 +105,20 @@ class CalibratedPolicy:
             ConfigurationError: no price, or a price at which the rule takes part.
         """
         if self.price is None:
-            raise validation.refusal("price", None, "a number: model:PATH,price=…")
+            raise refusal("price", None, "a number: model:PATH,price=…")
         (number,), (mixture,), (threshold,) = self.at(np.array([self.price]))
         if mixture > 0.0:
             why = f"0 at the price {self.price:g}: the rule reads signals that a file does not have"
-            raise validation.refusal("mixture", float(mixture), why)
-        agent = copy.deepcopy(self.agents[number])
-        bias: Any = agent.model.policy.action_net.bias
-        places = slice(None)
-        if isinstance(agent.view.actions, spaces.Discrete):
-            places = slice(1, None)
-        elif isinstance(agent.model, MaskablePPO):
-            places = slice(1, None, 2)
-        with torch.no_grad():
-            bias[places] -= float(threshold) * self.slopes[number]
-        return agent
+            raise refusal("mixture", float(mixture), why)
+        return self.agents[number].with_threshold(float(threshold) * self.slopes[number])
 
-    def at(self, price: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    def at(self, price: Array) -> Mixing:
         """Return agent, μ and c (N,) at prices (N,)."""
-        logs = np.log([point.price for point in self.points])
-        place = np.log(price)
-        mixture, threshold = (
-            np.interp(place, logs, [getattr(point, name) for point in self.points])
-            for name in ("mixture", "threshold")
-        )
-        nearest = np.abs(place - logs[:, None]).argmin(0)
-        return np.array([point.agent for point in self.points])[nearest], mixture, threshold
+        prices, agents, mixtures, thresholds = np.array(self.points).T
+        place, places = np.log(price), np.log(prices)
+        nearest = np.abs(place - places[:, None]).argmin(0)
+        mixture, threshold = (np.interp(place, places, part) for part in (mixtures, thresholds))
+        return agents.astype(np.int64)[nearest], mixture, threshold
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -170,13 +126,13 @@ class CalibratedPolicy:
         price = signals["price"] if self.price is None else np.full(tokens.shape, self.price)
         agent, mixture, threshold = self.at(np.asarray(price))
         score = np.zeros((self.task.sensors, len(tokens)))
-        if (mixture > 0.0).any():
-            score += _share(mixture, self.rule.log_ratio(signals))
+        if (mixture > 0.0).any():  # a share of 0 takes no part, where a score may be infinite
+            score += mixture * np.where(mixture > 0.0, self.rule.log_ratio(signals), 0.0)
         if (mixture < 1.0).any():
-            logits = np.stack([request_logits(item, signals) for item in self.agents])
+            logits = np.stack([item.logits(signals) for item in self.agents])
             logits /= np.array(self.slopes)[:, None, None]
             own = np.take_along_axis(logits, agent[None, None], 0)[0]
-            score += _share(1.0 - mixture, own)
+            score += (1.0 - mixture) * np.where(mixture < 1.0, own, 0.0)
         requests: Requests = score >= threshold
         if self.task.access == "single":  # an agent names one sensor, the rule leaves the choice
             best = score.argmax(0) == np.arange(len(score))[:, None]
@@ -184,31 +140,19 @@ class CalibratedPolicy:
         return requests
 
 
-def _share(share: Array, score: Array) -> Array:
-    """Return share · score, and 0 for a share of 0, where a score may be infinite."""
-    result = np.zeros(score.shape)
-    some = np.broadcast_to(share > 0.0, score.shape)
-    return np.multiply(share, score, out=result, where=some)
-
-
 def save_calibrated(
-    policy: CalibratedPolicy, rule: str, models: Sequence[bytes], path: Path
+    rule: str,
+    slopes: Sequence[float],
+    points: Sequence[CalibrationPoint],
+    files: Sequence[Path],
+    output: Path,
 ) -> None:
-    """Write a policy with the text of its rule and its agents' archives."""
-    content = {"rule": rule, "slopes": policy.slopes, "points": list(map(asdict, policy.points))}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    """Write a calibration with the text of its rule and its agents' files."""
+    content = {"rule": rule, "slopes": slopes, "points": [point._asdict() for point in points]}
+    with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(CALIBRATION, json.dumps(content, indent=1))
-        for number, model in enumerate(models):
-            archive.writestr(f"agent_{number}.zip", model)
-
-
-def holds_calibration(path: Path) -> bool:
-    """Return whether a file is a calibrated policy."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return CALIBRATION in archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError):
-        return False
+        for number, file in enumerate(files):
+            archive.writestr(f"agent_{number}.zip", file.read_bytes())
 
 
 def load_calibrated(path: Path, task: Task, price: float | None, trust: bool) -> CalibratedPolicy:
@@ -217,26 +161,22 @@ def load_calibrated(path: Path, task: Task, price: float | None, trust: bool) ->
     Raises:
         ConfigurationError: a part is missing, or a value is not allowed.
     """
-    from fusion_gym.policies.registry import make_policy
-
     try:
         content = json.loads(read_part(path, CALIBRATION))
         points = [CalibrationPoint(**point) for point in content["points"]]
-        slopes, text = [float(slope) for slope in content["slopes"]], str(content["rule"])
-        numbers = np.array([list(asdict(point).values()) for point in points], dtype=np.float64)
+        slopes = [float(slope) for slope in content["slopes"]]
+        numbers = np.array(points, dtype=np.float64)
         sound = np.isfinite(numbers).all() and (np.diff(numbers[:, 0]) > 0.0).all()
         known = set(numbers[:, 1]) <= set(range(len(slopes)))
         if not (sound and known and 0.0 < min(slopes) <= max(slopes) < np.inf):
             raise ValueError("its numbers are not allowed")
-        if text.partition(":")[0] != "priced_threshold":  # another name may run code
-            raise ValueError(f"its rule {text!r} is no priced_threshold")
+        rule = calibration_rule(str(content["rule"]), task)
     except (LookupError, TypeError, ValueError) as error:
         raise ConfigurationError(f"its calibration cannot be read: {error}") from None
-    agents = []
+    rule.price = rule.price if price is None else price
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(len(slopes)):
-            file = Path(folder) / f"agent_{number}.zip"
+        files = [Path(folder) / f"agent_{number}.zip" for number in range(len(slopes))]
+        for file in files:
             file.write_bytes(read_part(path, file.name))
-            agents.append(load_model_policy(str(file), task, True, price, trust=trust))
-    rule: Any = make_policy(text if price is None else f"{text},price={price!r}", task)
+        agents = [load_model_policy(str(file), task, True, price, trust=trust) for file in files]
     return CalibratedPolicy(task, agents, slopes, rule, points, price)

@@ -1,11 +1,15 @@
 """A Stable-Baselines3 agent as a policy, and the card that is saved with it."""
 
+import copy
 from typing import Any
 
 import numpy as np
+import torch
+from gymnasium import spaces
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from fusion_gym.arrays import Array
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Knowledge, Signals, least_covering
@@ -14,7 +18,7 @@ from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.belief_rule import beliefs_of
 from fusion_gym.policies.card import ENTRY, ModelView, algorithm_name, model_card
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
@@ -109,3 +113,40 @@ class ModelPolicy:
             column = np.full((len(own), 1), self.price, dtype=np.float32)
             observation = np.concatenate((own, column), axis=1)
         return self.view.rows(observation)
+
+    def check_logits(self) -> None:
+        """Refuse an agent without one logit for each sensor."""
+        actions, model = self.view.actions, self.model
+        if isinstance(model, RecurrentPPO) or not hasattr(model.policy, "action_net"):
+            allowed = "an agent with one logit for each sensor (ppo, a2c, trpo, maskable_ppo)"
+            raise refusal("policy", type(model).__name__, allowed)
+        together = isinstance(actions, spaces.Discrete) and self.view.rows_per_run == 1
+        if together and self.task.access != "single":
+            raise refusal("action", str(actions), "MultiBinary, or access='single'")
+
+    def logits(self, signals: Signals) -> Array:
+        """Return the logit (sensors, N) of each sensor's request over its silence."""
+        policy: Any = self.model.policy
+        rows, places = torch.as_tensor(self.rows(signals)), self._requests()
+        with torch.no_grad():
+            latent = policy.mlp_extractor.forward_actor(policy.extract_features(rows))
+            outputs: Array = policy.action_net(latent).numpy().astype(np.float64)
+        silence = np.delete(outputs, places, axis=1)
+        result = outputs[:, places] - (silence if silence.size else 0.0)
+        result = result.reshape(-1, self.task.sensors).T
+        masked = isinstance(self.model, MaskablePPO)
+        return np.where(signals["grantable"], result, -np.inf) if masked else result
+
+    def with_threshold(self, threshold: float) -> "ModelPolicy":
+        """Return the agent whose logits are lower by a threshold, in its last layer."""
+        result = copy.deepcopy(self)
+        policy: Any = result.model.policy
+        with torch.no_grad():
+            policy.action_net.bias[self._requests()] -= threshold
+        return result
+
+    def _requests(self) -> slice:
+        """Return the places of requests in the outputs of the network; the others are silence."""
+        if isinstance(self.view.actions, spaces.Discrete):
+            return slice(1, None)
+        return slice(1, None, 2) if isinstance(self.model, MaskablePPO) else slice(None)

@@ -26,10 +26,14 @@ def saved_agent(
     Raises:
         ConfigurationError: as :func:`fusion_gym.policies.loading.load_model_policy`.
     """
-    from fusion_gym.policies.calibrated import holds_calibration, load_calibrated
+    from fusion_gym.policies.archive import read_part
+    from fusion_gym.policies.calibrated import CALIBRATION, load_calibrated
     from fusion_gym.policies.loading import load_model_policy, model_file
 
-    if not holds_calibration(file := model_file(path)):
+    file = model_file(path)
+    try:
+        read_part(file, CALIBRATION)
+    except ConfigurationError:
         return load_model_policy(path, task, deterministic, price, trust=trust)
     if not deterministic:
         raise refusal("deterministic", deterministic, "true for calibrated agents")

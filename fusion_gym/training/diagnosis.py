@@ -14,7 +14,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.scale import sustained_tokens
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.policy_batch import run_priced
-from fusion_gym.evaluation.rule_search import ClassName, search_of_class
+from fusion_gym.evaluation.rule_search import class_of, search_of_class
 from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.training.callback import Callback
@@ -89,8 +89,7 @@ def threshold_costs(task: Task, local: bool, prices: Sequence[float]) -> Array:
     """Return the cost of the best single threshold of the class at each price; 1 at one price."""
     if len(prices) == 1:
         return np.ones(1)
-    name: ClassName = "centre" if task.information == "centre" else "scheduler"
-    search = search_of_class("local" if local else name, task, prices, episodes=(16, 16))
+    search = search_of_class(class_of(task, local), task, prices, episodes=(16, 16))
     return search.start_costs(search.start)
 
 

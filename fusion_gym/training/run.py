@@ -1,7 +1,7 @@
 """One training from config to summary, which can be interrupted and resumed."""
 
-import contextlib
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.importing import trust_files
 from fusion_gym.output.files import replacing, write, write_text
 from fusion_gym.output.folders import check_inputs, fingerprint, lock_folder
-from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.training.calibration import calibrate_files
+from fusion_gym.output.progress import progress_bar, quietly, remark, writing
+from fusion_gym.policies.loading import load_model_policy
+from fusion_gym.training.calibration import calibrate
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.checkpoint import Journal, read_journal, restore
 from fusion_gym.training.config import Experiment
@@ -143,12 +144,10 @@ def _learn(
         if finished:
             with replacing(folder / "final_model.zip") as partial:
                 model.save(partial)
-            if experiment.calibration is not None and len(progress.prices) > 1:
+            if experiment.calibration and len(progress.prices) > 1 and journal.best:
                 bar.say("calibrating")
-                episodes, files = experiment.calibration.episodes, [folder / "best_model.zip"]
-                with contextlib.suppress(ConfigurationError):  # an agent of another kind
-                    output = folder / "calibrated_model.zip"
-                    calibrate_files(scored, files, progress.prices, episodes, output)
+                with quietly(quiet):
+                    _calibrate(folder, scored, progress.prices, experiment.calibration.episodes)
     best = min(journal.records, key=lambda record: record["relative_cost"], default=None)
     summary = {
         "timesteps": model.num_timesteps,
@@ -162,6 +161,20 @@ def _learn(
     if not quiet:
         print(describe(summary, folder, time.perf_counter() - began))
     return summary
+
+
+def _calibrate(
+    folder: Path, task: Task, prices: Sequence[float], episodes: tuple[int, int]
+) -> None:
+    """Write the calibrated policy of the best model, if that has one logit for each sensor."""
+    file = folder / "best_model.zip"
+    agent = load_model_policy(str(file), task)
+    try:
+        agent.check_logits()
+    except ConfigurationError as error:
+        remark(f"no calibrated model: {error}")
+        return
+    calibrate(task, [file], prices, episodes, folder / "calibrated_model.zip")
 
 
 def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
