@@ -164,6 +164,25 @@ def test_a_file_is_the_policy(tmp_path: Path) -> None:
         make_policy(f"model:{tmp_path / 'policy.zip'}", task)
 
 
+def test_without_its_calibration_a_file_is_the_agent(tmp_path: Path) -> None:
+    task, agent, _ = made()
+    text, file = RULE.format(own="false", margin=1.7), saved(agent, tmp_path)
+    point, output = CalibrationPoint(0.3, 0, 1.0, 0.0), tmp_path / "policy.zip"
+    save_calibrated(text, [0.3], [point], [file], output)
+    for settings in ("", ",deterministic=false"):
+        alone = make_policy(f"model:{output},calibrated=false{settings}", task)
+        theirs = requests(task, make_policy(f"model:{file}{settings}", task)).returns
+        np.testing.assert_array_equal(requests(task, alone).returns, theirs)
+    with pytest.raises(ConfigurationError, match="deterministic = False is not allowed"):
+        make_policy(f"model:{output},deterministic=false", task)
+    save_calibrated(text, [0.3, 0.3], [point], [file, file], output)
+    with pytest.raises(ConfigurationError, match="price = None is not allowed"):
+        make_policy(f"model:{output},calibrated=false", task)
+    content = output.read_bytes()
+    save_calibrated(text, [0.3, 0.3], [point], [file, file], output)
+    assert output.read_bytes() == content
+
+
 POINT = {"price": 0.3, "agent": 0, "mixture": 0.0, "threshold": 0.0}
 
 

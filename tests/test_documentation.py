@@ -13,7 +13,7 @@ from page_blocks import blocks_of
 import fusion_gym
 from agents.benchmark.report import headline_text
 from agents.benchmark.settings import load_suite
-from agents.benchmark.tables import ClassRow, read_rows
+from agents.benchmark.tables import SavingRow, read_rows
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 
@@ -21,9 +21,6 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
-
-
-TITLES = {setting.name: setting.title for setting in load_suite().settings}
 
 
 def test_the_evaluation_command_runs(tmp_path: Path) -> None:
@@ -67,8 +64,19 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
 
 
 def test_the_readme_says_what_the_results_say() -> None:
-    titles = {setting.name: setting.title for setting in load_suite().settings}
-    assert headline_text(titles, read_rows(ROOT / "results", ClassRow)) in README
+    rows = read_rows(ROOT / "results", SavingRow)
+    assert headline_text(load_suite().settings, rows) in README
+
+
+def test_one_version_is_in_code_results_citations_and_changelog() -> None:
+    version = fusion_gym.__version__
+    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"version = {{{version}}}" in (ROOT / "docs/papers.bib").read_text()
+    assert f"in version {version}:" in (ROOT / "results/README.md").read_text()
+    headings = re.findall(r"^## \[(.*?)\](.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    number, _, development = version.partition(".dev")
+    assert headings[0][0] == number
+    assert ("unreleased" in headings[0][1]) == bool(development)
 
 
 def doc_of(env_id: str) -> str:
@@ -88,16 +96,6 @@ def test_every_option_and_entry_has_a_meaning_and_a_table(env_id: str) -> None:
     page = doc_of(env_id)
     assert re.search(rf"{{options-table}} .*{env_id}", page)
     assert "{observation-table} " in page
-
-
-def test_the_citation_is_of_this_version() -> None:
-    citation = (ROOT / "CITATION.cff").read_text()
-    project = (ROOT / "pyproject.toml").read_text()
-    for text in (citation, project):
-        assert re.search(r'^version(?:: | = ")([\d.]+)', text, re.MULTILINE)[1] == (  # type: ignore[index]
-            fusion_gym.__version__
-        )
-    assert f"version = {{{fusion_gym.__version__}}}" in (ROOT / "docs/papers.bib").read_text()
 
 
 def test_the_bibliography_has_every_paper_that_an_environment_names() -> None:

@@ -165,7 +165,7 @@ AGENTS = ["remote_estimation_local", "biased_oscillator_scheduler"]
 @pytest.mark.parametrize("name", AGENTS)
 def test_agents_of_the_zoo_are_exported_with_what_they_see(name: str, tmp_path: Path) -> None:
     path = tmp_path / "agent.onnx"
-    lines = command(f"zoo:{name}", path)
+    lines = command(f"zoo:{name},calibrated=false", path)
     assert f"{path.stat().st_size:,} bytes" in lines[0]
     assert re.search(r"against the agent on 10,[\d]{3} observations of \d+ episodes", lines[3])
     assert "all decisions agree" in lines[3]
@@ -204,7 +204,7 @@ def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) ->
     """Through PettingZoo, one row at a time, by names from the file: the same share of requests."""
     name, price = "tobit_oscillator_local", 0.2
     path = tmp_path / "sensor.onnx"
-    command(f"zoo:{name},price={price}", path)
+    command(f"zoo:{name},price={price},calibrated=false", path)
     session = onnxruntime.InferenceSession(str(path))
     trained = zoo.card(name)["training"]["environment"]
     env = fusion_gym.parallel_env(trained["id"], **trained["options"])
@@ -225,7 +225,7 @@ def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) ->
             visited = env.step(actions)[0]
         shares.append(np.mean(result, axis=0))
     task = fusion_gym.make_task(trained["id"], **trained["options"])
-    policy = make_policy(f"zoo:{name},price={price}", task)
+    policy = make_policy(f"zoo:{name},price={price},calibrated=false", task)
     expected = run_episodes(task, policy, 2, 5).requests
     np.testing.assert_allclose(shares, expected, atol=1e-12)
     assert 0.0 < expected.mean() < 0.9
@@ -233,7 +233,7 @@ def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) ->
 
 @pytest.mark.usefixtures("few")
 def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
-    name = "zoo:tobit_oscillator_scheduler"
+    name = "zoo:tobit_oscillator_scheduler,calibrated=false"
     command(name, tmp_path / "all.onnx")
     command(f"{name},price=0.03", tmp_path / "one.onnx")
     every, row = (onnxruntime.InferenceSession(str(tmp_path / f"{n}.onnx")) for n in ("all", "one"))
@@ -241,7 +241,7 @@ def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
     assert "price" not in about["observation_names"]
     assert about["fixed_price"] == pytest.approx(0.03)
     assert about["price_range"] is None
-    task = fusion_gym.make_task(ENV, **zoo.card(name[4:])["training"]["environment"]["options"])
+    task = fusion_gym.make_task(ENV, **zoo.card(name[4:-17])["training"]["environment"]["options"])
     rows = EpisodeBatch.seeded(task, 64, 0).observe()
     place = describe(tmp_path / "all.onnx")["observation_names"].index("price")
     low, high = describe(tmp_path / "all.onnx")["price_range"]
@@ -276,8 +276,13 @@ def test_a_training_of_ones_own_says_its_environment(tmp_path: Path) -> None:
 REFUSED = [
     ("always", {}, "it must be zoo:NAME, model:PATH or the path of a .zip"),
     ("zoo:nobody", {}, "zoo = 'nobody'"),
-    ("zoo:tobit_oscillator_scheduler,deterministic=false", {}, "deterministic = False"),
+    (
+        "zoo:tobit_oscillator_scheduler,deterministic=false,calibrated=false",
+        {},
+        "deterministic = False",
+    ),
     ("zoo:tobit_oscillator_scheduler,price=9", {}, "price"),
+    ("zoo:tobit_oscillator_scheduler", {}, "price = None is not allowed"),
     ("zoo:tobit_oscillator_scheduler", {"env": "fusion_gym/CorrelatedTracking-v1"}, "layout"),
 ]
 
@@ -296,7 +301,7 @@ def test_a_file_that_decides_otherwise_is_not_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "agent.onnx"
-    command("zoo:tobit_oscillator_centre,price=0.2", tmp_path / "other.onnx")
+    command("zoo:tobit_oscillator_centre,price=0.2,calibrated=false", tmp_path / "other.onnx")
     path.write_text("kept")
 
     def wrong(graph: Any, to: Path, metadata: Any) -> None:
@@ -306,7 +311,7 @@ def test_a_file_that_decides_otherwise_is_not_kept(
     with pytest.raises(
         ConfigurationError, match=r"is not exported: file .* [\d,]+ of .* observations, and"
     ):
-        command("zoo:tobit_oscillator_centre,price=0.1", path)
+        command("zoo:tobit_oscillator_centre,price=0.1,calibrated=false", path)
     assert path.read_text() == "kept"
     assert len(list(tmp_path.iterdir())) == 2
 

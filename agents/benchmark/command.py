@@ -24,6 +24,7 @@ from agents.benchmark.evidence import (
     evaluate_policy,
     gather,
     point_rows,
+    processor_seconds,
     search_again,
 )
 from agents.benchmark.jobs import Runner
@@ -34,7 +35,7 @@ from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.options import OutputFolder, Whole, writable_folder
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.folders import lock_folder
-from fusion_gym.output.progress import writing
+from fusion_gym.output.progress import remark, writing
 from fusion_gym.validation import refusal
 
 
@@ -88,6 +89,8 @@ class Benchmark(Long):
                     classes = search_again(suite, runner)
                 print_classes(class_rows(classes), point_rows(suite, classes))
                 return
+            minutes = processor_seconds(suite) / 60.0 / self.workers
+            remark(f"about {minutes:.0f} minutes with workers={self.workers}, less what is done")
             classes = gather(suite, runner)
             write_results(suite, classes, folder)
             print_classes(class_rows(classes), point_rows(suite, classes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,23 +15,28 @@ from agents.benchmark.jobs import Runner
 from agents.benchmark.rules import SearchJob, SweepJob, SweepResult, rules_of, run_search, run_sweep
 from agents.benchmark.settings import (
     CLASSES,
-    TEST_SEED,
-    VALIDATION_SEED,
     Case,
     ClassName,
     Setting,
     Suite,
     knowledge_of,
 )
-from agents.benchmark.tables import CaseRow, ChoiceRow, ClassRow, PointRow, TestRow
-from agents.benchmark.training import TrainingJob, run_training
+from agents.benchmark.tables import (
+    CaseRow,
+    ClassRow,
+    PointRow,
+    SavingRow,
+    TestRow,
+    TrainingRow,
+)
+from agents.benchmark.training import CALIBRATION, TrainingJob, TrainingResult, run_training
 from agents.benchmark.verdict import (
     Difference,
     TestJob,
     TestResult,
     cost_difference,
     discoveries,
-    over_prices,
+    mean_difference,
     run_test,
 )
 from fusion_gym.core.system import covers
@@ -39,6 +45,7 @@ from fusion_gym.validation import ConfigurationError
 
 TestResults = tuple[TestResult, ...]
 REFERENCE = "rule"
+CALIBRATED = {"agent": "learned", "other": "other_learned"}  # by the kind of the agent alone
 
 
 @dataclass
@@ -48,11 +55,9 @@ class Evidence:
     setting: Setting
     name: ClassName
     sweep: SweepResult
-    memoryless: SweepResult | None = None
     rule: str = ""
-    models: list[Path] = field(default_factory=list)
+    trainings: dict[str, list[tuple[TrainingJob, TrainingResult]]] = field(default_factory=dict)
     tests: dict[str, list[TestResults]] = field(default_factory=dict)
-    validations: dict[str, list[TestResults]] = field(default_factory=dict)
     bounds: tuple[float, ...] = ()
     cases: dict[str, tuple[TestResults, TestResults]] = field(default_factory=dict)
 
@@ -62,8 +67,8 @@ class Evidence:
         return self.sweep.prices
 
     def test(
-        self, policies: Sequence[str], episodes: int, seed: int = TEST_SEED,
-        case: Case | None = None, prices: Sequence[float] | None = None,
+        self, policies: Sequence[str], episodes: int, case: Case | None = None,
+        prices: Sequence[float] | None = None,
     ) -> TestJob:  # fmt: skip
         """Return the test of one policy per price; the key of an agent is its file's content."""
         own_prices = tuple(self.prices if prices is None else prices)
@@ -77,27 +82,24 @@ class Evidence:
             file = Path(texts[0].removeprefix("model:").rpartition(",price=")[0])
             content = hashlib.sha256(file.read_bytes()).hexdigest()
         return TestJob(
-            self.setting, self.name, texts, own_prices, self.prices, episodes, seed, content,
-            agent, None, case,
-        )  # fmt: skip
+            self.setting, self.name, texts, own_prices, self.prices, episodes, content, agent, case
+        )
 
     @property
-    def best_agent(self) -> int:
-        """Training seed of the agent with the least cost in validation."""
-        reference = self.validations[REFERENCE][0]
-        scores = [over_prices([outcomes], reference).mean for outcomes in self.validations["agent"]]
-        return int(np.argmin(scores))
+    def priced_rule(self) -> str:
+        """Text of the searched rule with ``{price}``."""
+        return f"{self.rule},price={{price}}"
 
     @property
-    def choice(self) -> tuple[str, int]:
-        """Kind and seed of the policy with the least cost in validation."""
-        reference = self.validations[REFERENCE][0]
-        scores = {
-            (kind, seed): over_prices([outcomes], reference).mean
-            for kind, every in self.validations.items()
-            for seed, outcomes in enumerate(every)
-        }
-        return min(scores, key=scores.__getitem__)
+    def best_seed(self) -> int:
+        """Seed of the training whose calibrated policy costs least on its tuning episodes."""
+        costs = [result.relative_cost for _, result in self.trainings["agent"]]
+        return int(np.argmin(costs))
+
+    @property
+    def best_policy(self) -> Path:
+        """File of the calibrated policy with that seed."""
+        return self.trainings["agent"][self.best_seed][0].policy
 
 
 def gather(suite: Suite, runner: Runner) -> list[Evidence]:
@@ -108,104 +110,108 @@ def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     jobs = [BoundJob(item.setting, item.name, item.prices) for item in classes]
     for item, bounds in zip(classes, runner.run(run_bound, jobs, "bounds"), strict=True):
         item.bounds = bounds
-    test_all(suite, runner, classes)
+    places = [(item, kind, texts) for item in classes for kind, texts in policies_of(item)]
+    test_all(suite, runner, places)
     test_cases(suite, runner, [item for item in classes if item.name == "scheduler"])
     return classes
+
+
+def processor_seconds(suite: Suite) -> float:
+    """Return about the seconds of all work on one core."""
+    total = 0.0
+    for setting in suite.settings:
+        for name in CLASSES:
+            trainings = suite.seeds(setting, name) * len(suite.algorithms(setting, name))
+            total += SweepJob.weight + suite.generations / 30 * SearchJob.weight
+            total += trainings * suite.steps * setting.seconds[name] * (1.0 + CALIBRATION)
+            total += (3 + 2 * trainings) * suite.episodes / 1000 * TestJob.weight
+    return total
 
 
 def find_prices(
     suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASSES
 ) -> list[Evidence]:
     """Tune the rules with one threshold, and freeze the prices of the classes."""
-
-    def sweep(
-        setting: Setting, name: ClassName, memory: bool, prices: tuple[float, ...] = ()
-    ) -> SweepJob:
-        rules = rules_of(setting, name, suite.rules, memory)
-        return SweepJob(setting, name, memory, rules, suite.shares, suite.tuning_episodes, prices)
-
     places = [(setting, name) for setting in suite.settings for name in names]
-    jobs = [sweep(setting, name, setting.has_memory(name)) for setting, name in places]
+    jobs = [
+        SweepJob(*place, rules_of(*place, suite.rules), suite.shares, suite.tuning_episodes)
+        for place in places
+    ]
     results = runner.run(run_sweep, jobs, "single thresholds")
-    classes = [Evidence(*place, result) for place, result in zip(places, results, strict=True)]
-    others = [item for item in classes if item.setting.has_memory(item.name)]
-    jobs = [sweep(item.setting, item.name, False, item.prices) for item in others]
-    results = runner.run(run_sweep, jobs, "single thresholds without memory")
-    for item, result in zip(others, results, strict=True):
-        item.memoryless = result
-    return classes
+    return [Evidence(*place, result) for place, result in zip(places, results, strict=True)]
 
 
 def find_rules(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
     """Search one rule for all prices of each class."""
+    generations, folder = suite.generations, runner.folder / "searches"
     jobs = [
-        SearchJob(
-            item.setting, item.name, item.prices, suite.generations, runner.folder / "searches"
-        )
-        for item in classes
+        SearchJob(item.setting, item.name, item.prices, generations, folder) for item in classes
     ]
     for item, text in zip(classes, runner.run(run_search, jobs, "searches"), strict=True):
-        item.rule = f"{text},price={{price}}"
+        item.rule = text
 
 
 def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
-    """Train one agent per class and seed."""
-    places = [(item, seed) for item in classes for seed in range(suite.training_seeds)]
-    jobs = []
-    for item, seed in places:
-        folder = runner.folder / "agents" / f"{item.setting.name}_{item.name}_{seed}"
-        experiment = suite.experiment(item.setting, item.name, item.prices, seed)
-        jobs.append(TrainingJob(item.setting, item.name, experiment, folder))
-    runner.run(run_training, jobs, "trainings")
-    for (item, _), job in zip(places, jobs, strict=True):
-        item.models.append(job.model)
-
-
-def test_all(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
-    """Test every kind of policy on the test episodes, and rules and agents in validation."""
-    places: list[tuple[Evidence, str, bool]] = []
-    jobs: list[TestJob] = []
+    """Train and calibrate the agents of all classes, and those of the comparison."""
+    places = []
     for item in classes:
-        for kind, policies in policies_of(item):
-            case = item.setting.trigger.case if kind == "trigger" else None
-            places.append((item, kind, True))
-            jobs.append(item.test(policies, suite.episodes, case=case))
-            if kind in (REFERENCE, "agent"):
-                places.append((item, kind, False))
-                jobs.append(item.test(policies, suite.validation_episodes, VALIDATION_SEED))
-    for (item, kind, final), outcomes in zip(
-        places, runner.run(run_test, jobs, "tests"), strict=True
+        for kind, (algorithm, steps) in suite.algorithms(item.setting, item.name).items():
+            for seed in range(suite.seeds(item.setting, item.name)):
+                folder = f"{item.setting.name}_{item.name}_{algorithm.name}_{seed}"
+                experiment = suite.experiment(
+                    item.setting, item.name, item.prices, seed, algorithm, steps
+                )
+                job = TrainingJob(
+                    item.setting, item.name, experiment, item.prices, item.rule,
+                    suite.calibration_episodes, runner.folder / "agents" / folder,
+                )  # fmt: skip
+                places.append((item, kind, job))
+    jobs = [job for _, _, job in places]
+    for (item, kind, job), result in zip(
+        places, runner.run(run_training, jobs, "trainings"), strict=True
     ):
-        tests = item.tests if final else item.validations
-        tests.setdefault(kind, []).append(outcomes)
+        item.trainings.setdefault(kind, []).append((job, result))
+
+
+def test_all(
+    suite: Suite, runner: Runner, places: Sequence[tuple[Evidence, str, list[str]]]
+) -> None:
+    """Test policies of a class and kind, one at each price, on the test episodes."""
+    jobs = [
+        item.test(texts, suite.episodes, item.setting.trigger.case if kind == "trigger" else None)
+        for item, kind, texts in places
+    ]
+    for (item, kind, _), outcomes in zip(places, runner.run(run_test, jobs, "tests"), strict=True):
+        item.tests.setdefault(kind, []).append(outcomes)
 
 
 def policies_of(item: Evidence) -> Iterator[tuple[str, list[str]]]:
     """Yield the kinds of policy of a class, each with one policy per price."""
     count = len(item.prices)
-    yield REFERENCE, [item.rule] * count
+    yield REFERENCE, [item.priced_rule] * count
     yield "threshold", [item.sweep.best(price).policy for price in item.prices]
     trigger = item.setting.trigger.policy
     if any(tuned.rule == trigger for tuned in item.sweep.tuned):
         yield "trigger", [item.sweep.best(price, trigger).policy for price in item.prices]
     if item.setting.optimum is not None and item.name == "scheduler":
         yield "optimum", [item.setting.optimum] * count
-    for model in item.models:
-        yield "agent", [f"model:{model},price={{price}}"] * count
+    for kind, every in item.trainings.items():
+        for job, _ in every:
+            yield kind, [f"model:{job.agent},price={{price}}"] * count
+            yield CALIBRATED[kind], [f"model:{job.policy},price={{price}}"] * count
 
 
 def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
-    """Test the rule, and the agent with the least validation cost, in every perturbed case."""
+    """Test the rule, and the learned policy with the least cost in tuning, in perturbed cases."""
     places: list[tuple[Evidence, str]] = []
     jobs: list[TestJob] = []
     for item in classes:
-        agent = f"model:{item.models[item.best_agent]},price={{price}}"
+        texts = item.priced_rule, f"model:{item.best_policy},price={{price}}"
         prices = item.prices[1:4]  # the middle ones
         for case in (None, *suite.cases_of(item.setting)):
             places.append((item, "as assumed" if case is None else case.name))
-            for text in (item.rule, agent):
-                policies = [text] * len(prices)
-                jobs.append(item.test(policies, suite.case_episodes, case=case, prices=prices))
+            for text in texts:
+                jobs.append(item.test([text] * 3, suite.case_episodes, case, prices))
     results = runner.run(run_test, jobs, "perturbed cases")
     for place, (item, name) in enumerate(places):
         item.cases[name] = results[2 * place], results[2 * place + 1]
@@ -214,10 +220,8 @@ def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> Non
 def check_policy(suite: Suite, text: str, name: ClassName) -> None:
     """Refuse a policy that does not exist in every setting, or knows more than its class."""
     for setting in suite.settings:
-        policy, knower = (
-            make_policy(text.replace("{price}", "1.0"), setting.task(name)),
-            knowledge_of(setting, name),
-        )
+        policy = make_policy(text.replace("{price}", "1.0"), setting.task(name))
+        knower = knowledge_of(setting, name)
         if not covers(knower, policy.knowledge):
             raise ConfigurationError(
                 f"policy = {text!r} is not allowed with class = {name!r} in {setting.name}: it "
@@ -229,8 +233,7 @@ def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) ->
     """Test a policy in a class of every setting, together with the searched rule."""
     classes = find_prices(suite, runner, (name,))
     find_rules(suite, runner, classes)
-    kinds = {REFERENCE: [item.rule for item in classes], "policy": [text] * len(classes)}
-    test_texts(suite, runner, classes, kinds)
+    test_pairs(suite, runner, classes, "policy", [text] * len(classes))
     return classes
 
 
@@ -240,45 +243,48 @@ def search_again(suite: Suite, runner: Runner) -> list[Evidence]:
     find_rules(suite, runner, classes)
     drawn = np.random.default_rng(0).choice(len(classes), min(3, len(classes)), replace=False)
     classes = [classes[place] for place in sorted(drawn)]
-    generations = 4 * suite.generations
+    generations, folder = 4 * suite.generations, runner.folder / "searches"
     jobs = [
-        SearchJob(
-            c.setting, c.name, c.prices, generations, runner.folder / "searches", 2_000_000_000
-        )
-        for c in classes
+        SearchJob(item.setting, item.name, item.prices, generations, folder, 2_000_000_000)
+        for item in classes
     ]
     texts = [f"{text},price={{price}}" for text in runner.run(run_search, jobs, "second searches")]
-    test_texts(
-        suite, runner, classes, {REFERENCE: [item.rule for item in classes], "second": texts}
-    )
+    test_pairs(suite, runner, classes, "second", texts)
     return classes
 
 
-def test_texts(
-    suite: Suite, runner: Runner, classes: Sequence[Evidence], kinds: dict[str, list[str]]
+def test_pairs(
+    suite: Suite, runner: Runner, classes: Sequence[Evidence], kind: str, texts: Sequence[str]
 ) -> None:
-    """Test one policy of every kind for each class, at all prices."""
-    for kind, texts in kinds.items():
-        jobs = [
-            item.test([text] * len(item.prices), suite.episodes)
-            for item, text in zip(classes, texts, strict=True)
-        ]
-        for item, outcomes in zip(classes, runner.run(run_test, jobs, kind), strict=True):
-            item.tests[kind] = [outcomes]
+    """Test the searched rule and another policy for each class, at all prices."""
+    places = [
+        (item, name, [policy] * len(item.prices))
+        for item, text in zip(classes, texts, strict=True)
+        for name, policy in ((REFERENCE, item.priced_rule), (kind, text))
+    ]
+    test_all(suite, runner, places)
 
 
 def policy_rows(suite: Suite, classes: Sequence[Evidence]) -> list[TestRow]:
-    """Return a row for every policy at every price."""
-    return [
+    """Return a row for every policy at every price, and for the bound of the cost."""
+    rows = [
         TestRow(
             item.setting.name, item.name, kind, seed, share, o.price, float(o.cost.mean()),
             float(o.error.mean()), float(o.tokens.mean()), o.mse, o.rate,
-            "" if kind == "agent" else o.policy,
+            "" if o.policy.startswith("model:") else o.policy,
         )
         for item in classes
         for kind, every in item.tests.items()
         for seed, outcomes in enumerate(every)
         for share, o in zip(suite.shares, outcomes, strict=True)
+    ]  # fmt: skip
+    return rows + [
+        TestRow(
+            item.setting.name, item.name, "bound", 0, share, price, bound, math.nan, math.nan,
+            math.nan, math.nan, "",
+        )
+        for item in classes
+        for share, price, bound in zip(suite.shares, item.prices, item.bounds, strict=False)
     ]  # fmt: skip
 
 
@@ -307,47 +313,66 @@ def class_rows(classes: Sequence[Evidence]) -> list[ClassRow]:
 
     The proven bound is a kind of its own, without an interval.
     """
-    rows = [
-        ClassRow(item.setting.name, item.name, kind, d.mean, d.low, d.high)
-        for item in classes
-        for kind, every in item.tests.items()
-        if kind != REFERENCE
-        for d in [over_prices(every, item.tests[REFERENCE][0])]
-    ]
+    rows = []
     for item in classes:
+        (reference,) = item.tests[REFERENCE]
+        for kind, every in item.tests.items():
+            if kind != REFERENCE:
+                d = mean_difference([(every, reference)])
+                median = float(np.median([mean_difference([([o], reference)]).mean for o in every]))
+                rows.append(
+                    ClassRow(item.setting.name, item.name, kind, d.mean, d.low, d.high, median)
+                )
         if item.bounds:
-            costs = [float(outcome.cost.mean()) for outcome in item.tests[REFERENCE][0]]
+            costs = [float(outcome.cost.mean()) for outcome in reference]
             below = float(np.mean(np.divide(item.bounds, costs))) - 1.0
-            rows.append(ClassRow(item.setting.name, item.name, "bound", below, below, below))
+            rows.append(ClassRow(item.setting.name, item.name, "bound", below, below, below, below))
     return rows
 
 
-def choice_rows(classes: Sequence[Evidence]) -> list[ChoiceRow]:
-    """Return the policy of each class with the least validation cost, and the effect of memory."""
+def saving_rows(classes: Sequence[Evidence]) -> list[SavingRow]:
+    """Return the cost that each kind saves against the settings' own triggers.
+
+    It is the mean over prices and over the classes in which the trigger runs.
+    """
+    rows = []
+    for setting in dict.fromkeys(item.setting.name for item in classes):
+        own = [i for i in classes if i.setting.name == setting and "trigger" in i.tests]
+        for kind in ("threshold", REFERENCE, "learned"):
+            d = mean_difference([(item.tests[kind], item.tests["trigger"][0]) for item in own])
+            rows.append(SavingRow(setting, kind, len(own), -d.mean, -d.high, -d.low))
+    return rows
+
+
+def training_rows(classes: Sequence[Evidence]) -> list[TrainingRow]:
+    """Return a row for each training, with its costs over the searched rule's, minus 1."""
     rows = []
     for item in classes:
-        kind, seed = item.choice
-        d = over_prices([item.tests[kind][seed]], item.tests[REFERENCE][0])
-        memory = float("nan")
-        if item.memoryless is not None:
-            costs = [
-                item.memoryless.best(price).cost / item.sweep.best(price).cost
-                for price in item.prices
-            ]
-            memory = float(np.mean(costs)) - 1.0
-        rows.append(
-            ChoiceRow(item.setting.name, item.name, kind, d.mean, d.low, d.high, memory, item.rule)
-        )
+        (reference,) = item.tests[REFERENCE]
+        for kind, every in item.trainings.items():
+            for seed, (job, result) in enumerate(every):
+                alone, learned = (
+                    mean_difference([([item.tests[name][seed]], reference)]).mean
+                    for name in (kind, CALIBRATED[kind])
+                )
+                rule_only = sum(point.mixture == 1.0 for point in result.points)
+                rows.append(
+                    TrainingRow(
+                        item.setting.name, item.name, kind, job.experiment.algorithm.name, seed,
+                        job.experiment.training.timesteps, result.seconds,
+                        result.calibration_seconds, rule_only, alone, learned,
+                    )
+                )  # fmt: skip
     return rows
 
 
 def case_rows(classes: Sequence[Evidence]) -> list[CaseRow]:
-    """Return the costs of every scheduler's rule and agent in the perturbed cases."""
+    """Return the costs of every scheduler's rule and learned policy in the perturbed cases."""
     rows = []
     for item in classes:
-        for case, (rule, agent) in item.cases.items():
+        for case, (rule, learned) in item.cases.items():
             base = item.cases["as assumed"][0]
-            d = over_prices([agent], rule)
-            change = over_prices([rule], base).mean
+            d = mean_difference([([learned], rule)])
+            change = mean_difference([([rule], base)]).mean
             rows.append(CaseRow(item.setting.name, case, change, d.mean, d.low, d.high))
     return rows

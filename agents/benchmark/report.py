@@ -5,22 +5,37 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 from rich.table import Table
 
 from agents.benchmark.evidence import (
+    CALIBRATED,
     Evidence,
     case_rows,
-    choice_rows,
     class_rows,
     point_rows,
     policy_rows,
+    saving_rows,
+    training_rows,
 )
-from agents.benchmark.settings import CLASSES, Suite
-from agents.benchmark.tables import ChoiceRow, ClassRow, PointRow, TestRow, write_rows
+from agents.benchmark.settings import CLASSES, Setting, Suite
+from agents.benchmark.tables import (
+    CaseRow,
+    ClassRow,
+    PointRow,
+    SavingRow,
+    TestRow,
+    TrainingRow,
+    write_rows,
+)
+from fusion_gym.arrays import Array
 from fusion_gym.docstrings import table
 from fusion_gym.output import tables
 from fusion_gym.output.figures import save_figure
@@ -28,58 +43,95 @@ from fusion_gym.output.files import write_text
 from fusion_gym.output.palette import READABLE
 from fusion_gym.version import __version__
 
-ERROR = "error a step, in the reward's weights"
 HEADLINE = "tobit_oscillator", "scheduler"  # the class of README's figure
-GAIN = 0.01  # a difference that the sentences name
+GAIN = 0.01  # a difference that the sentences name, and between a mean and a median
 README = Path("README.md")
 TITLES = {"centre": "fusion centre", "local": "local sensors", "scheduler": "centralised scheduler"}
-LINES = {  # kind: label, colour, marker
-    "trigger": ("own trigger, scaled", "tab:gray", "v"),
-    "threshold": ("best rule with one threshold", "tab:blue", "o"),
-    "rule": ("searched rule", "black", "s"),
-    "agent": ("agents", "tab:orange", "^"),
-    "optimum": ("optimum", "tab:green", "*"),
-    "bound": ("proven bound", "tab:red", "_"),
+KNOWLEDGE = {
+    "centre": "what it received, before it asks for a measurement",
+    "local": "each sensor its own measurements and what the centre broadcasts",
+    "scheduler": "the measurements of all sensors and what the centre received",
 }
+
+
+class Style(NamedTuple):
+    """Label, colour and marker of a kind of policy."""
+
+    label: str
+    colour: str
+    marker: str
+
+
+STYLES = {
+    "trigger": Style("own trigger", "tab:gray", "v"),
+    "threshold": Style("one tuned threshold", "tab:blue", "o"),
+    "rule": Style("searched rule", "black", "s"),
+    "learned": Style("learned policy", "tab:orange", "^"),
+    "optimum": Style("optimum", "tab:green", "*"),
+    "bound": Style("proven bound", "tab:red", "_"),
+}
+
+
+class Results(NamedTuple):
+    """All rows of the benchmark."""
+
+    policies: list[TestRow]
+    points: list[PointRow]
+    means: list[ClassRow]
+    savings: list[SavingRow]
+    trainings: list[TrainingRow]
+    cases: list[CaseRow]
 
 
 def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> None:
     """Write all tables, a figure per setting, the page, and README's table."""
     folder.mkdir(parents=True, exist_ok=True)
-    policies, points = policy_rows(suite, classes), point_rows(suite, classes)
-    means, choices = class_rows(classes), choice_rows(classes)
-    cases = case_rows([item for item in classes if item.name == "scheduler"])
-    for rows in (policies, points, means, choices, cases):
+    results = Results(
+        policy_rows(suite, classes),
+        point_rows(suite, classes),
+        class_rows(classes),
+        saving_rows(classes),
+        training_rows(classes),
+        case_rows([item for item in classes if item.name == "scheduler"]),
+    )
+    for rows in results:
         write_rows(folder, rows)
-    for setting in suite.settings:
-        own = [row for row in policies if row.setting == setting.name]
-        draw_setting(own, setting.title, folder / f"{setting.name}.png")
-    for item in classes:
-        if (item.setting.name, item.name) == HEADLINE:
-            draw_headline(policies, item, folder / "readme.png")
     titles = {setting.name: setting.title for setting in suite.settings}
-    headline = headline_text(titles, means)
+    for name, title in titles.items():
+        draw_setting([row for row in results.policies if row.setting == name], title, folder)
+    draw_headline(results, titles, folder / "readme.png")
+    headline = headline_text(suite.settings, results.savings)
+    short, long = suite.training_seeds
     page = [
         "# Benchmark",
         f"Results of `make benchmark` in version {__version__}: {suite.episodes:,} test episodes, "
-        f"{suite.training_seeds} training seeds. [Method](../docs/benchmark.md).",
+        f"{long} trainings of an agent, {short} where one takes less than a minute. "
+        "[Method](../docs/benchmark.md).",
         headline,
-        "\n".join(f"- {text}" for text in sentences(means, points)),
-        "## Classes",
-        "Mean over five prices of the cost over the searched rule's cost; negative: cheaper.",
-        class_table(titles, means, choices),
+        "## Against the searched rule",
+        "Cost over the searched rule's, %: mean over five prices, seeds and episodes; negative: "
+        "cheaper. A class is what decides, by what it knows:",
+        "\n".join(f"- **{TITLES[name]}**: {KNOWLEDGE[name]}." for name in CLASSES),
+        class_table(titles, results),
+        "\n".join(f"- {text}" for text in sentences(results)),
+        "## What credit and calibration add",
+        "Stable-Baselines3's PPO and counterfactual credit with the same processor time, alone and "
+        "calibrated. Seconds of one training; cost over the searched rule's, %.",
+        comparison_table(titles, results),
         "## Searched rules",
         table(
             ("setting", "class", "policy"),
-            ((titles[row.setting], TITLES[row.name], f"`{row.rule}`") for row in choices),
+            ((i.setting.title, TITLES[i.name], f"`{i.priced_rule}`") for i in classes),
         ),
         "## Wrong models",
-        "The scheduler's searched rule and the best agent in validation, at the three middle "
-        "prices: the rule's cost over its cost with a true model, and the agent's cost over the "
-        "rule's.",
+        "The scheduler's searched rule and learned policy at the three middle prices: the rule's "
+        "cost over its cost with a true model, and the learned policy's cost over the rule's, %.",
         table(
-            ("setting", "case", "rule", "agent"),
-            ((titles[r.setting], r.case, f"{r.rule:+.0%}", relative_text(r)) for r in cases),
+            ("setting", "case", "rule", "learned policy"),
+            (
+                (titles[r.setting], r.case, percent(r.rule, 0), interval(r, r.difference))
+                for r in results.cases
+            ),
         ),
         *(
             f"## {title}\n\n![Error against tokens a step, by class]({name}.png)"
@@ -94,133 +146,234 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
         write_text(README, re.sub(pattern, lambda _: part, text, flags=re.DOTALL))
 
 
-def relative_text(row: ClassRow | PointRow | ChoiceRow | object) -> str:
-    """Return a difference with its interval, in per cent."""
-    mean, low, high = (100.0 * getattr(row, name) for name in ("difference", "low", "high"))
-    interval = "" if low == high else f" [{low:+.1f}, {high:+.1f}]"
-    return f"{mean:+.1f}{interval}".replace("-", "−")
+def percent(value: float, digits: int = 1) -> str:
+    """Return a share in per cent, with its sign."""
+    return f"{100.0 * value:+.{digits}f}".replace("-", "−")
 
 
-def headline_text(titles: dict[str, str], rows: Sequence[ClassRow]) -> str:
-    """Return the table of agents relative to searched rules, settings by classes."""
-    agents = {(row.setting, row.name): relative_text(row) for row in rows if row.kind == "agent"}
+def interval(row: PointRow | ClassRow | SavingRow | CaseRow, value: float) -> str:
+    """Return a value in per cent with half the width of its row's interval."""
+    half = 50.0 * (row.high - row.low)
+    return percent(value) + (f" ± {half:.1f}" if half > 0.0 else "")
+
+
+def headline_text(settings: Sequence[Setting], rows: Sequence[SavingRow]) -> str:
+    """Return the table of what thresholds, search and learning save, a row for each setting."""
+    kinds = "threshold", "rule", "learned"
+    by_kind = {(row.setting, row.kind): row for row in rows}
     cells = (
-        (title, *(agents.get((name, column), "–") for column in CLASSES))
-        for name, title in titles.items()
+        (
+            setting.title,
+            setting.trigger_title,
+            *(
+                interval(row, row.saving).removeprefix("+")
+                for row in (by_kind[setting.name, kind] for kind in kinds)
+            ),
+        )
+        for setting in settings
     )
-    head = ("cost of agents over the searched rule's, %", *TITLES.values())
+    labels = {kind: STYLES[kind].label for kind in kinds}
     medians = {
-        kind: np.median([row.difference for row in rows if row.kind == kind] or [np.nan])
-        for kind in ("trigger", "threshold", "agent")
+        kind: f"{100.0 * np.median([r.saving for r in rows if r.kind == kind] or [np.nan]):.1f}"
+        for kind in kinds
     }
     text = (
-        "Negative: the agent is better. In the median class the setting's own trigger, scaled, "
-        f"costs {medians['trigger']:+.1%} over the searched rule, the best rule with one threshold "
-        f"{medians['threshold']:+.1%}, and an agent {medians['agent']:+.1%}."
+        "Cost saved against the setting's own trigger at equal price, % with the 95 % interval "
+        "over seeds and episodes: the mean over five prices and the classes in which the trigger "
+        f"runs. In the median setting a learned policy saves {medians['learned']} %, the searched "
+        f"rule {medians['rule']} % and one tuned threshold {medians['threshold']} %."
     )
-    return f"{table(head, cells)}\n\n{text.replace('-', '−')}"
+    return f"{table(('setting', 'own trigger', *labels.values()), cells)}\n\n{text}"
 
 
-def class_table(
-    titles: dict[str, str], rows: Sequence[ClassRow], choices: Sequence[ChoiceRow]
-) -> str:
+def class_table(titles: dict[str, str], results: Results) -> str:
     """Return the table of every kind of policy relative to the searched rule."""
-    by_kind = {(row.setting, row.name, row.kind): relative_text(row) for row in rows}
-    kinds = [kind for kind in LINES if kind != "rule"]
+    by_kind = {(row.setting, row.name, row.kind): row for row in results.means}
+    trainings, shares = grouped(results.trainings), len({row.share for row in results.policies})
     lines = []
-    for row in choices:
-        cells = [by_kind.get((row.setting, row.name, kind), "–") for kind in kinds]
-        memory = "–" if np.isnan(row.memory) else f"{row.memory:+.1%}".replace("-", "−")
-        best = f"{row.choice} {relative_text(row)}" if row.choice != "rule" else "rule"
-        lines.append((titles[row.setting], TITLES[row.name], *cells, best, memory))
-    heads = (LINES[kind][0] for kind in kinds)
-    return table(("setting", "class", *heads, "validation chooses", "without memory"), lines)
+    for place in dict.fromkeys((row.setting, row.name) for row in results.means):
+        cells = [
+            mean_text(by_kind.get((*place, kind)))
+            for kind in ("learned", "agent", "threshold", "trigger")
+        ]
+        best = by_kind.get((*place, "optimum")) or by_kind.get((*place, "bound"))
+        limit = f"{best.kind} {mean_text(best)}" if best else "–"
+        own = trainings[*place, "agent"]
+        rule = f"{sum(row.rule_points for row in own)} of {len(own) * shares}"
+        lines.append((titles[place[0]], TITLES[place[1]], *cells, limit, rule))
+    heads = (
+        *("setting", "class", "learned policy", "agents alone", "one tuned threshold"),
+        *("own trigger", "optimum or bound", "points with the rule alone"),
+    )
+    return table(heads, lines)
 
 
-def sentences(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> list[str]:
-    """Return the sentences on the gains of the search and of agents."""
+def mean_text(row: ClassRow | None) -> str:
+    """Return a mean with its interval, and with the median where an outlier moves the mean."""
+    if row is None:
+        return "–"
+    moved = abs(row.difference - row.median) >= GAIN
+    return interval(row, row.difference) + (f" (median {percent(row.median)})" if moved else "")
+
+
+def comparison_table(titles: dict[str, str], results: Results) -> str:
+    """Return the table of both algorithms in the classes where there are two."""
+    by_kind = {(row.setting, row.name, row.kind): row for row in results.means}
+    trainings = grouped(results.trainings)
+    lines = [
+        (
+            *(titles[setting], TITLES[name], own[0].algorithm),
+            f"{np.mean([row.seconds for row in own]):.0f}",
+            *(mean_text(by_kind[setting, name, item]) for item in (kind, CALIBRATED[kind])),
+        )
+        for (setting, name, kind), own in trainings.items()
+        if (setting, name, "other") in trainings
+    ]
+    return table(("setting", "class", "algorithm", "seconds", "agents alone", "calibrated"), lines)
+
+
+def grouped(rows: Sequence[TrainingRow]) -> dict[tuple[str, str, str], list[TrainingRow]]:
+    """Return the trainings of each setting, class and kind."""
+    result: dict[tuple[str, str, str], list[TrainingRow]] = {}
+    for row in rows:
+        result.setdefault((row.setting, row.name, row.kind), []).append(row)
+    return result
+
+
+def sentences(results: Results) -> list[str]:
+    """Return the sentences on the gains of learned policies."""
+    rows = {kind: [r for r in results.means if r.kind == kind] for kind in ("learned", "agent")}
 
     def mean(kind: str) -> str:
-        values = [row.difference for row in rows if row.kind == kind]
-        over = f"{np.mean(values):+.1%} in the mean over {len(values)} classes"
-        ends = f"{min(values):+.1%} to {max(values):+.1%}"
-        return f"{over} (median {np.median(values):+.1%}, {ends})".replace("-", "−")
+        values = [row.difference for row in rows[kind]]
+        ends = f"{percent(min(values))} to {percent(max(values))}"
+        middle = percent(float(np.median(values)))
+        return f"{percent(float(np.mean(values)))} % (median {middle} %, {ends} %)"
 
     def places(sign: int) -> str:
-        """Return the classes where agents differ by more than the gain, with a whole interval."""
+        """Return the classes whose difference exceeds the gain, with a whole interval."""
         count = [
             f"{row.setting.replace('_', ' ')} ({TITLES[row.name]})"
-            for row in rows
-            if row.kind == "agent"
-            and sign * row.difference >= GAIN
-            and min(sign * row.low, sign * row.high) > 0.0
+            for row in rows["learned"]
+            if sign * row.difference >= GAIN and min(sign * row.low, sign * row.high) > 0.0
         ]
         return ", ".join(count) or "none"
 
-    counted = [point for point in points if point.kind == "agent" and point.discovery]
-    fewer = sum(point.difference < 0 for point in counted)
+    points = [point for point in results.points if point.kind == "learned"]
+    fewer = sum(point.discovery and point.difference < 0.0 for point in points)
+    more = sum(point.discovery and point.difference > 0.0 for point in points)
+    costs = [
+        [row.learned for row in own]
+        for (_, _, kind), own in grouped(results.trainings).items()
+        if kind == "agent"
+    ]
+    near = sum(max(own) - min(own) <= 0.02 for own in costs)
     return [
-        "The settings' own triggers (the papers', and what devices run), scaled by one number, "
-        f"cost {mean('trigger')} more than the searched rule.",
-        f"The best rule with one threshold, tuned at each price, costs {mean('threshold')} more.",
-        f"Agents cost {mean('agent')} more; they are cheaper at {fewer} points and dearer at "
-        f"{len(counted) - fewer}, with a false discovery rate of 5 %.",
-        f"Agents gain at least {GAIN:.0%}, with a whole interval, in: {places(-1)}.",
-        f"Agents lose at least {GAIN:.0%}, with a whole interval, in: {places(1)}.",
+        f"The mean over {len(costs)} classes is {mean('learned')} for learned policies and "
+        f"{mean('agent')} for agents alone.",
+        f"Learned policies are cheaper at {fewer} of {len(points)} points and dearer at {more}, "
+        "with a false discovery rate of 5 %.",
+        f"They gain at least {GAIN:.0%}, with a whole interval, in: {places(-1)}.",
+        f"They lose at least {GAIN:.0%}, with a whole interval, in: {places(1)}.",
+        f"Trainings of one class differ by at most 2 points in {near} of {len(costs)} classes.",
     ]
 
 
-def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
+def mean_line(rows: Sequence[TestRow], kind: str) -> Array:
+    """Return price, cost, error and tokens (4, prices) of a kind, as means over seeds."""
+    own = [(row.price, row.cost, row.error, row.tokens) for row in rows if row.kind == kind]
+    prices = sorted({item[0] for item in own})
+    line = [np.mean([item for item in own if item[0] == price], axis=0) for price in prices]
+    return np.array(line).reshape(-1, 4).T
+
+
+def draw_setting(rows: Sequence[TestRow], title: str, folder: Path) -> None:
     """Draw error against tokens per step, one panel per class."""
     plt.rcParams.update(READABLE)
     names = list(dict.fromkeys(row.name for row in rows))
     figure, panels = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.6), squeeze=False)
+    labels: dict[str, Line2D] = {}
     for panel, name in zip(panels[0], names, strict=True):
-        draw_class(panel, [row for row in rows if row.name == name])
+        labels |= draw_class(panel, [row for row in rows if row.name == name])
         panel.set(title=TITLES[name])
-    panels[0][0].set_ylabel(ERROR)
+    panels[0][0].set_ylabel("error a step")
     figure.suptitle(title)
     figure.tight_layout(rect=(0.0, 0.08, 1.0, 1.0))
-    figure.legend(*panels[0][-1].get_legend_handles_labels(), loc="lower center", ncols=5)
-    save_figure(figure, path)
+    figure.legend(list(labels.values()), list(labels), loc="lower center", ncols=5)
+    save_figure(figure, folder / f"{rows[0].setting}.png")
 
 
-def draw_headline(rows: Sequence[TestRow], item: Evidence, path: Path) -> None:
-    """Draw one class and its proven bound: error >= max over prices of (bound - price · tokens)."""
+def draw_class(panel: Axes, rows: Sequence[TestRow]) -> dict[str, Line2D]:
+    """Draw error against tokens in one class, and return the lines by label.
+
+    Points without tokens stand at a tick "0" of their own, left of a dotted line.
+    """
+    zero = min(row.tokens for row in rows if row.tokens > 0.0) / 2.5
+    labels = {}
+    for kind in ("trigger", "rule", "learned", "optimum"):
+        label, colour, marker = STYLES[kind]
+        _, _, error, tokens = mean_line(rows, kind)
+        if len(error):
+            style: Any = {"color": colour, "marker": marker, "markersize": 5}
+            order = np.argsort(tokens)[np.count_nonzero(tokens == 0.0) :]
+            (labels[label],) = panel.plot(tokens[order], error[order], linewidth=1, **style)
+            silent = error[tokens == 0.0]
+            panel.plot(np.full(len(silent), zero), silent, linestyle="", **style)
+    panel.set(xscale="log", yscale="log", xlabel="tokens a step")
+    silence = any(row.tokens == 0.0 for row in rows)
+    if silence:
+        panel.axvline(1.5 * zero, color="tab:gray", linestyle=":", linewidth=1)
+    plain_ticks(panel.yaxis)
+    plain_ticks(panel.xaxis, zero if silence else None)
+    return labels
+
+
+def plain_ticks(axis: Axis, zero: float | None = None) -> None:
+    """Write the ticks of a logarithmic axis as plain numbers, and "0" at the place of zero."""
+    low, high = axis.get_view_interval()
+    low = low if zero is None else 1.5 * zero
+    values: list[float] = []
+    for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)):
+        if len(values) < 3:
+            values = [d * 10.0**power for power in range(-6, 7) for d in digits]
+            values = [value for value in values if low <= value <= high]
+    ticks = {value: f"{value:g}" for value in values} | ({} if zero is None else {zero: "0"})
+    axis.set_major_locator(FixedLocator(list(ticks)))
+    axis.set_major_formatter(FixedFormatter(list(ticks.values())))
+    axis.set_minor_locator(NullLocator())
+
+
+def draw_headline(results: Results, titles: dict[str, str], path: Path) -> None:
+    """Draw cost against price in one class: own trigger, learned policy with its saving, bound."""
+    rows = [row for row in results.policies if (row.setting, row.name) == HEADLINE]
+    if not any(row.kind == "trigger" for row in rows):
+        return
     plt.rcParams.update(READABLE)
     figure, panel = plt.subplots(figsize=(7.0, 4.4))
-    draw_class(
-        panel, [row for row in rows if (row.setting, row.name) == (item.setting.name, item.name)]
-    )
-    if item.bounds:
-        label, colour, _ = LINES["bound"]
-        tokens = np.geomspace(*panel.get_xlim(), 200)
-        errors = np.max(np.array(item.bounds) - np.multiply.outer(tokens, item.prices), axis=1)
-        panel.plot(tokens[errors > 0], errors[errors > 0], "--", color=colour, label=label)
-    panel.set(ylabel=ERROR, title=f"{item.setting.title}, {TITLES[item.name]}")
+    lines = {kind: mean_line(rows, kind) for kind in ("trigger", "learned", "bound")}
+    for kind, (prices, costs, _, _) in lines.items():
+        label, colour, marker = STYLES[kind]
+        dash = "--" if kind == "bound" else "-"
+        panel.plot(prices, costs, dash, color=colour, marker=marker, label=label)
+    for (price, trigger, *_), (_, learned, *_) in zip(
+        lines["trigger"].T, lines["learned"].T, strict=True
+    ):
+        panel.annotate(
+            "", (price, learned), (price, trigger),
+            arrowprops={"arrowstyle": "->", "color": STYLES["learned"].colour, "linewidth": 0.8},
+        )  # fmt: skip
+        middle = price, (trigger * learned) ** 0.5
+        saving = f" {percent(learned / trigger - 1.0, 0)} %"
+        panel.annotate(saving, middle, va="center", color=STYLES["learned"].colour)
+    panel.set(
+        xscale="log", yscale="log", xlabel="price of a token", ylabel="error + price · tokens",
+        title=f"{titles[HEADLINE[0]]}, {TITLES[HEADLINE[1]]}: cost of a step",
+    )  # fmt: skip
+    plain_ticks(panel.xaxis)
+    plain_ticks(panel.yaxis)
     panel.legend()
     figure.tight_layout()
     save_figure(figure, path)
-
-
-def draw_class(panel: Axes, rows: Sequence[TestRow]) -> None:
-    """Draw error against tokens per step in one class, a line for each policy and seed."""
-    for kind, (label, colour, marker) in LINES.items():
-        own = [row for row in rows if row.kind == kind]
-        for seed in sorted({row.seed for row in own}):
-            line = [row for row in own if row.seed == seed]
-            panel.plot(
-                [row.tokens for row in line], [row.error for row in line], color=colour,
-                marker=marker, markersize=5, linewidth=1, label=label if seed == 0 else None,
-            )  # fmt: skip
-    panel.set(xscale="log", yscale="log", xlabel="tokens a step")
-    if any(row.tokens == 0.0 for row in rows):  # at a tick of its own, left of the others
-        least = min(row.tokens for row in rows if row.tokens > 0.0)
-        panel.set_xscale("symlog", linthresh=least, linscale=0.3)
-        ends = -0.2 * least, panel.get_xlim()[1]
-        decades = 10.0 ** np.arange(np.ceil(np.log10(least)), np.log10(ends[1]))
-        panel.set(xticks=[0.0, *decades], xlim=ends)
-    panel.xaxis.set_minor_formatter("")
 
 
 def print_classes(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> None:
@@ -235,7 +388,7 @@ def print_classes(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> None:
             if (p.setting, p.name, p.kind) == (row.setting, row.name, row.kind)
         }
         result.add_row(
-            row.setting, row.name, row.kind, relative_text(row),
-            *(f"{100 * own[share].difference:+.1f}" if own else "–" for share in shares),
+            row.setting, row.name, row.kind, mean_text(row),
+            *(percent(own[share].difference) if own else "–" for share in shares),
         )  # fmt: skip
     tables.console().print(result)

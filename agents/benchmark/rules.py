@@ -44,13 +44,11 @@ NEAR = 1.1  # rules whose cost is so near the least, as a factor, are tuned fine
 
 @dataclass(frozen=True)
 class SweepJob(Job):
-    """Every rule of a class over its thresholds, with ``prices`` on a finer grid near the best."""
+    """Every rule of a class over its thresholds, on a finer grid near the best at each price."""
 
-    memory: bool
     rules: tuple[ThresholdRule, ...]
     shares: tuple[float, ...]
     episodes: tuple[int, int]
-    prices: tuple[float, ...] = ()
     weight: ClassVar[float] = 40.0
 
 
@@ -93,15 +91,15 @@ class SearchJob(Job):
 
 
 def run_sweep(job: SweepJob) -> SweepResult:
-    """Tune every rule of a class on the tuning episodes, and choose missing prices."""
-    tasks = {rule: job.setting.task(job.name, job.memory, rule.case) for rule in job.rules}
+    """Choose the prices of a class, and tune every rule at each on the tuning episodes."""
+    tasks = {rule: job.setting.task(job.name, rule.case) for rule in job.rules}
     trials = {
         rule: _try(task, rule, np.geomspace(*rule.ends, COUNT), job.episodes[0])
         for rule, task in tasks.items()
     }
     usual = {rule: own for rule, own in trials.items() if rule.case is None}
-    task = job.setting.task(job.name, job.memory)
-    prices = job.prices or _prices(task, list(itertools.chain(*usual.values())), job)
+    task = job.setting.task(job.name)
+    prices = _prices(task, list(itertools.chain(*usual.values())), job)
     tuned = []
     for price in prices:
         best = {rule: min(own, key=lambda t: t.cost(price)) for rule, own in trials.items()}
@@ -115,14 +113,14 @@ def run_sweep(job: SweepJob) -> SweepResult:
 
 
 def rules_of(
-    setting: Setting, name: ClassName, rules: Sequence[ThresholdRule], memory: bool
+    setting: Setting, name: ClassName, rules: Sequence[ThresholdRule]
 ) -> tuple[ThresholdRule, ...]:
     """Return the rules whose declared knowledge the class covers."""
     knower = knowledge_of(setting, name)
     result = []
     for rule in dict.fromkeys((setting.trigger, *setting.more_rules, *rules)):
         try:
-            task = setting.task(name, memory, rule.case)
+            task = setting.task(name, rule.case)
             policy = make_policy(rule.policy.format(value=rule.ends[0]), task)
         except ConfigurationError:  # a rule of another family
             continue

@@ -21,8 +21,8 @@ from fusion_gym.validation import choice
 
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)
 FILE = Path(__file__).with_name("settings.yaml")
-# First episodes: of tests, of the choice between policies, and of tuning.
-TEST_SEED, VALIDATION_SEED, TUNING_SEED = 0, 800_000_000, 600_000_000
+TEST_SEED, TUNING_SEED = 0, 600_000_000  # of the first episodes
+SHORT = 60  # seconds of a short training
 Options = dict[str, Any]
 
 
@@ -51,7 +51,7 @@ class ThresholdRule(Strict):
 class Setting(Strict):
     """An environment with options, its own trigger, and the length of its trainings.
 
-    ``optimum`` is a policy with ``{price}``.
+    ``optimum`` is a policy with ``{price}``, ``seconds`` about those of a training in a class.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -59,11 +59,13 @@ class Setting(Strict):
     environment: str
     options: Options
     trigger: ThresholdRule
+    trigger_title: str
     more_rules: tuple[ThresholdRule, ...] = ()
     agent_options: Options = pydantic.Field(default_factory=dict)
     memory: bool = True
     optimum: str | None = None
     timesteps: Positive
+    seconds: dict[ClassName, Positive]
     num_envs: Positive = 1024
     error: Literal["squared", "excess", "mismatch"] = "mismatch"
     cases: tuple[Case, ...] = ()
@@ -72,10 +74,9 @@ class Setting(Strict):
         """Return whether the policies of a class have memory."""
         return self.memory and name != "centre"
 
-    def task(self, name: ClassName, memory: bool | None = None, case: Case | None = None) -> Task:
-        """Return the task of a class's rules, by default with memory and without a case."""
-        memory = self.has_memory(name) if memory is None else memory
-        options = self.options | ({"memory": True} if memory else {})
+    def task(self, name: ClassName, case: Case | None = None) -> Task:
+        """Return the task of a class's rules."""
+        options = self.options | ({"memory": True} if self.has_memory(name) else {})
         return make_task(self.environment, **_perturbed(options, case))
 
     def agent_environment(
@@ -93,17 +94,29 @@ class Setting(Strict):
         return _perturbed(options, case)
 
 
+class Comparison(Strict):
+    """Another algorithm, in one class of some settings, with a factor of each one's time steps."""
+
+    algorithm: AnyAlgorithm
+    name: ClassName
+    steps: dict[str, Rate]
+
+
 class Suite(Strict):
-    """The whole benchmark; ``steps`` multiplies the lengths of all trainings."""
+    """The whole benchmark; ``steps`` multiplies the lengths of all trainings.
+
+    ``training_seeds`` are the numbers of short trainings and of others.
+    """
 
     episodes: Positive
-    validation_episodes: Positive
     tuning_episodes: tuple[Positive, Positive]
+    calibration_episodes: tuple[Positive, Positive]
     case_episodes: Positive
     generations: Positive
-    training_seeds: Positive
+    training_seeds: tuple[Positive, Positive]
     shares: tuple[Share, ...]
     algorithm: AnyAlgorithm
+    comparison: Comparison
     steps: Rate = 1.0
     rules: tuple[ThresholdRule, ...]
     cases: tuple[Case, ...]
@@ -113,18 +126,38 @@ class Suite(Strict):
         """Return the perturbed cases of a setting."""
         return setting.cases or self.cases
 
+    def seeds(self, setting: Setting, name: ClassName) -> int:
+        """Return the number of trainings of a class."""
+        short, long = self.training_seeds
+        return short if setting.seconds[name] < SHORT else long
+
+    def algorithms(
+        self, setting: Setting, name: ClassName
+    ) -> dict[str, tuple[AnyAlgorithm, float]]:
+        """Return the algorithms of a class by kind, each with the factor of its time steps."""
+        result: dict[str, tuple[AnyAlgorithm, float]] = {"agent": (self.algorithm, 1.0)}
+        if name == self.comparison.name and setting.name in self.comparison.steps:
+            result["other"] = self.comparison.algorithm, self.comparison.steps[setting.name]
+        return result
+
     def experiment(
-        self, setting: Setting, name: ClassName, prices: tuple[float, ...], seed: int
+        self,
+        setting: Setting,
+        name: ClassName,
+        prices: tuple[float, ...],
+        seed: int,
+        algorithm: AnyAlgorithm,
+        steps: float,
     ) -> Experiment:
-        """Return the training of one agent, whose price is random in each episode."""
-        timesteps = max(round(setting.timesteps * self.steps), 1)
+        """Return the training of one agent at random prices, with a factor of its time steps."""
+        timesteps = max(round(setting.timesteps * self.steps * steps), 1)
         return Experiment(
             environment=EnvironmentConfig(
                 id=setting.environment,
                 options=setting.agent_environment(name, (min(prices), max(prices))),
                 local=name == "local",
             ),
-            algorithm=self.algorithm,
+            algorithm=algorithm,
             training=TrainingConfig(
                 timesteps=timesteps,
                 num_envs=setting.num_envs,

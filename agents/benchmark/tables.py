@@ -21,7 +21,7 @@ class TestRow:
 
     setting: str
     name: str  # of the class
-    kind: str  # rule, threshold, trigger, agent, optimum, or the user's policy
+    kind: str  # rule, threshold, trigger, agent, learned, other, …, optimum, the user's policy
     seed: int  # of the training
     share: float  # of the tokens of ``always`` that the best single threshold spends there
     price: float
@@ -50,7 +50,7 @@ class PointRow:
 
 @dataclass(frozen=True)
 class ClassRow:
-    """The mean of these differences over a class's prices."""
+    """The mean of these differences over a class's prices and seeds; the median over seeds."""
 
     setting: str
     name: str
@@ -58,29 +58,41 @@ class ClassRow:
     difference: float
     low: float
     high: float
+    median: float
 
 
 @dataclass(frozen=True)
-class ChoiceRow:
-    """The policy of a class with the least validation cost, and the effect of memory.
+class SavingRow:
+    """The share of the own trigger's cost that a kind saves: a mean over prices and classes."""
 
-    ``memory`` is the cost of single thresholds without memory over their cost with it, minus 1, on
-    the tuning episodes; NaN for a class without memory.
-    """
+    setting: str
+    kind: str
+    classes: int
+    saving: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class TrainingRow:
+    """A training and its calibration: processor seconds, and costs over the rule's, minus 1."""
 
     setting: str
     name: str
-    choice: str
-    difference: float
-    low: float
-    high: float
-    memory: float
-    rule: str
+    kind: str
+    algorithm: str
+    seed: int
+    timesteps: int
+    seconds: float
+    calibration_seconds: float
+    rule_points: int  # prices at which the calibration takes the rule alone
+    alone: float
+    learned: float
 
 
 @dataclass(frozen=True)
 class CaseRow:
-    """A perturbed case: the rule's cost over its nominal cost, and the agent's over the rule's."""
+    """A perturbed case: the rule's cost over its nominal cost, the learned policy's over that."""
 
     setting: str
     case: str
@@ -94,7 +106,8 @@ KINDS: dict[type, str] = {
     TestRow: "policies",
     PointRow: "points",
     ClassRow: "classes",
-    ChoiceRow: "choices",
+    SavingRow: "savings",
+    TrainingRow: "trainings",
     CaseRow: "cases",
 }
 

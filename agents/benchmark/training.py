@@ -1,37 +1,82 @@
-"""Agents of a class: one training per seed, at random prices of the class's range."""
+"""Agents of a class at random prices of its range, each calibrated with the searched rule."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
+import numpy as np
 import torch
 
 from agents.benchmark.jobs import Job
+from agents.benchmark.small_model import small_model
+from fusion_gym.envs.registration import make_task
+from fusion_gym.output.files import replacing
+from fusion_gym.output.progress import quietly
+from fusion_gym.policies.calibrated import CalibrationPoint
+from fusion_gym.training.calibration import EPISODES, calibrate
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import holds_training, train
+
+CALIBRATION = 0.3  # seconds of a calibration over those of a training
 
 
 @dataclass(frozen=True)
 class TrainingJob(Job):
-    """One agent; its checkpoints and model are in the experiment's folder."""
+    """One agent and its calibration; checkpoints and models are in the folder."""
 
     experiment: Experiment
-    folder: Path = field(metadata={"key": False})
-    weight: ClassVar[float] = 70.0
+    prices: tuple[float, ...]
+    rule: str
+    episodes: tuple[int, int] = EPISODES
+    folder: Path = field(default=Path(), metadata={"key": False})
 
     @property
-    def model(self) -> Path:
-        """Return the file of the finished agent."""
-        return self.folder / "best_model.zip"
+    def weight(self) -> float:  # type: ignore[override]
+        """Return about the seconds on one core, with those of the calibration."""
+        return (1.0 + CALIBRATION) * self.setting.seconds[self.name]
+
+    @property
+    def agent(self) -> Path:
+        """Return the file of the agent, without its optimiser's state."""
+        return self.folder / "agent.zip"
+
+    @property
+    def policy(self) -> Path:
+        """Return the file of the calibrated agent."""
+        return self.folder / "calibrated_model.zip"
 
 
-def run_training(job: TrainingJob) -> float:
-    """Train or continue, and return the processor seconds."""
+@dataclass(frozen=True)
+class TrainingResult:
+    """Processor seconds of training and calibration, and the calibration.
+
+    ``relative_cost`` is the mean over the prices of the cost over the rule's, minus 1, in tuning.
+    """
+
+    seconds: float
+    calibration_seconds: float
+    relative_cost: float
+    points: tuple[CalibrationPoint, ...]
+
+
+def run_training(job: TrainingJob) -> TrainingResult:
+    """Train or continue, calibrate, and return the costs of both."""
     torch.set_num_threads(1)
     experiment = job.experiment.model_copy(update={"output": str(job.folder)})
     summary = train(experiment, resume=holds_training(job.folder), quiet=True)
     if not summary["finished"]:
         raise KeyboardInterrupt
-    return float(sum(summary["seconds"].values()))
+    with replacing(job.agent) as partial:
+        partial.write_bytes(small_model(job.folder / "best_model.zip"))
+    environment, began = experiment.environment, time.process_time()
+    task = make_task(environment.id, **environment.options)
+    with quietly():
+        rows = calibrate(task, [job.agent], job.prices, job.episodes, job.policy, job.rule)
+    return TrainingResult(
+        sum(value for name, value in summary["seconds"].items() if name != "validation"),
+        time.process_time() - began,
+        float(np.mean([row.cost / row.rule_cost for row in rows])) - 1.0,
+        tuple(row.point for row in rows),
+    )

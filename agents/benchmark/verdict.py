@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from agents.benchmark.jobs import Job
-from agents.benchmark.settings import Case
+from agents.benchmark.settings import TEST_SEED, Case
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
@@ -23,7 +23,7 @@ FALSE_DISCOVERIES = 0.05
 
 @dataclass(frozen=True)
 class TestJob(Job):
-    """A policy at each price, on episodes from a first seed.
+    """A policy at each price, on the test episodes.
 
     ``content`` is the text of all policies, or the hash of an agent's file. An agent runs in the
     class's environment for agents, whose price range is ``class_prices``; a rule runs in the
@@ -35,17 +35,15 @@ class TestJob(Job):
     prices: tuple[float, ...]
     class_prices: tuple[float, ...]
     episodes: int
-    seed: int
     content: str
     agent: bool = False
-    memory: bool | None = None
     case: Case | None = None
     weight: ClassVar[float] = 20.0
 
     def task(self) -> Task:
         """Return the task of the test."""
         if not self.agent:
-            return self.setting.task(self.name, self.memory, self.case)
+            return self.setting.task(self.name, self.case)
         span = min(self.class_prices), max(self.class_prices)
         options = self.setting.agent_environment(self.name, span, self.case)
         return make_task(self.setting.environment, **options)
@@ -73,7 +71,7 @@ def run_test(job: TestJob) -> tuple[TestResult, ...]:
     task, result = job.task(), []
     for text, price in zip(job.policies, job.prices, strict=True):
         policy = make_policy(text, task)
-        results = run_episodes(task, policy, job.episodes, job.seed)
+        results = run_episodes(task, policy, job.episodes, TEST_SEED)
         rate, mse = float(results.rate.mean()), float(results.mse.mean())
         result.append(TestResult(text, price, results.error_cost, results.tokens, mse, rate))
     return tuple(result)
@@ -90,38 +88,45 @@ class Difference:
 
 
 def cost_difference(costs: Sequence[Array], reference: Array) -> Difference:
-    """Return the relative difference of costs (E,) of one or more seeds to a reference's (E,).
+    """Return the relative difference of costs (E,) of one or more seeds to a reference's (E,)."""
+    return _difference([(np.array(costs) - reference) / reference.mean()])
 
-    Seeds and episodes are crossed random factors: the variance of the mean is the seed means'
-    variance over their number plus the episode means' over theirs, with Satterthwaite's degrees of
-    freedom.
+
+def mean_difference(
+    pairs: Sequence[tuple[Sequence[Sequence[TestResult]], Sequence[TestResult]]],
+) -> Difference:
+    """Return the mean relative difference over classes and their prices.
+
+    Each pair has the results of one or more seeds in a class, and those of its reference.
     """
-    values = (np.array(costs) - reference) / reference.mean()
-    seeds, episodes = values.shape
-    parts = [float(values.mean(0).var(ddof=1)) / episodes]
-    freedom = [episodes - 1]
-    if seeds > 1:
-        parts.append(float(values.mean(1).var(ddof=1)) / seeds)
-        freedom.append(seeds - 1)
-    variance, mean = sum(parts), float(values.mean())
+    blocks = []
+    for seeds, reference in pairs:
+        base = np.array([r.cost for r in reference])
+        costs = np.array([[o.cost for o in outcomes] for outcomes in seeds])
+        blocks.append(((costs - base) / base.mean(1, keepdims=True)).mean(1))
+    return _difference(blocks)
+
+
+def _difference(blocks: Sequence[Array]) -> Difference:
+    """Return the mean of blocks (seeds, E) of differences, and its interval.
+
+    Seeds and episodes are crossed random factors: the variance of the mean is the variance of the
+    episodes' means over their number plus that of each block's seeds over theirs, with
+    Satterthwaite's degrees of freedom.
+    """
+    episodes = np.mean([block.mean(0) for block in blocks], axis=0)
+    parts = [(float(episodes.var(ddof=1)) / len(episodes), len(episodes) - 1)]
+    for block in blocks:
+        if len(block) > 1:
+            spread = float(block.mean(1).var(ddof=1)) / len(block)
+            parts.append((spread / len(blocks) ** 2, len(block) - 1))
+    variance, mean = sum(part for part, _ in parts), float(episodes.mean())
     if variance == 0.0:
         return Difference(mean, mean, mean, float(mean == 0.0))
-    degrees = variance**2 / sum(part**2 / df for part, df in zip(parts, freedom, strict=True))
+    degrees = variance**2 / sum(part**2 / freedom for part, freedom in parts)
     reach = float(stats.t.ppf(0.5 + LEVEL / 2.0, degrees)) * variance**0.5
     p = 2.0 * float(stats.t.sf(abs(mean) / variance**0.5, degrees))
     return Difference(mean, mean - reach, mean + reach, p)
-
-
-def over_prices(
-    outcomes: Sequence[Sequence[TestResult]], reference: Sequence[TestResult]
-) -> Difference:
-    """Return the mean relative difference over the prices, of one or more seeds."""
-    relative = [
-        np.mean([o.cost / r.cost.mean() for o, r in zip(seed, reference, strict=True)], axis=0)
-        for seed in outcomes
-    ]
-    base = np.mean([r.cost / r.cost.mean() for r in reference], axis=0)
-    return cost_difference(relative, base)
 
 
 def discoveries(p_values: Sequence[float]) -> list[bool]:

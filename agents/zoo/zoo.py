@@ -1,10 +1,10 @@
-"""Put one agent of each class of the benchmark into the model zoo, with its card.
+"""Put one learned policy of each class of the benchmark into the model zoo, with its card.
 
     python -m agents.zoo --work runs/benchmark
 
-The training seed has the least cost in validation, so the test figures are unbiased. The command
-first runs the benchmark's unfinished work. It removes agents of other names. A model has
-Stable-Baselines3's format, without the state of its optimiser.
+A learned policy is an agent that is calibrated with the searched rule. Its training seed has the
+least cost on the tuning episodes, so the test figures are unbiased. The command first runs the
+benchmark's unfinished work. It removes policies of other names.
 """
 
 import hashlib
@@ -17,7 +17,6 @@ from agents.benchmark.evidence import Evidence, gather
 from agents.benchmark.jobs import Runner
 from agents.benchmark.settings import TEST_SEED, Suite, knowledge_of, load_suite
 from agents.workers import Pool
-from agents.zoo.small_model import small_model
 from fusion_gym import zoo
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.options import OutputFolder, Whole
@@ -27,7 +26,7 @@ from fusion_gym.output.progress import writing
 
 @dataclass(frozen=True)
 class Zoo(Long):
-    """Put one agent of each class of the benchmark into the model zoo, with its card."""
+    """Put one learned policy of each class of the benchmark into the model zoo, with its card."""
 
     program = "python -m agents.zoo"
 
@@ -47,7 +46,7 @@ class Zoo(Long):
             f"{item.setting.name}_{item.name}": item
             for item in gather(suite, Runner(work, Pool(self.workers)))
         }
-        models = {name: small_model(item.models[item.best_agent]) for name, item in classes.items()}
+        models = {name: item.best_policy.read_bytes() for name, item in classes.items()}
         writing((f"{len(models)} agents with their cards", self.zoo))
         for name, item in classes.items():
             write(self.zoo / f"{name}.json", agent_card(suite, item, models[name]))
@@ -60,8 +59,8 @@ class Zoo(Long):
 
 def agent_card(suite: Suite, item: Evidence, model: bytes) -> dict[str, Any]:
     """Return the content of an agent's JSON."""
-    seed = item.best_agent
-    experiment = suite.experiment(item.setting, item.name, item.prices, seed)
+    seed = item.best_seed
+    experiment = item.trainings["agent"][seed][0].experiment
     options = dict(experiment.environment.options)
     for name in ("cost_weight", "price_range"):
         options.pop(name)
@@ -85,7 +84,7 @@ def agent_card(suite: Suite, item: Evidence, model: bytes) -> dict[str, Any]:
                     "mse": outcome.mse,
                     "rate": outcome.rate,
                 }
-                for outcome in item.tests["agent"][seed]
+                for outcome in item.tests["learned"][seed]
             ],
         },
     }

@@ -108,9 +108,22 @@ class CalibratedPolicy:
             raise refusal("price", None, "a number: model:PATH,price=…")
         (number,), (mixture,), (threshold,) = self.at(np.array([self.price]))
         if mixture > 0.0:
-            why = f"0 at the price {self.price:g}: the rule reads signals that a file does not have"
+            why = (
+                f"0 at the price {self.price:g}: the rule reads signals that a file does not have; "
+                "calibrated=false gives the agent alone"
+            )
             raise refusal("mixture", float(mixture), why)
         return self.agents[number].with_threshold(float(threshold) * self.slopes[number])
+
+    def nearest_agent(self) -> ModelPolicy:
+        """Return the agent of the price that is nearest to the policy's, without calibration.
+
+        Raises:
+            ConfigurationError: no price, and more than one agent.
+        """
+        if self.price is None and len(self.agents) > 1:
+            raise refusal("price", None, "a number: the file has several agents")
+        return self.agents[self.at(np.array([self.price or 1.0]))[0][0]]
 
     def at(self, price: Array) -> Mixing:
         """Return agent, μ and c (N,) at prices (N,)."""
@@ -147,12 +160,13 @@ def save_calibrated(
     files: Sequence[Path],
     output: Path,
 ) -> None:
-    """Write a calibration with the text of its rule and its agents' files."""
+    """Write a calibration with the text of its rule and its agents' files, without times."""
     content = {"rule": rule, "slopes": slopes, "points": [point._asdict() for point in points]}
-    with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(CALIBRATION, json.dumps(content, indent=1))
-        for number, file in enumerate(files):
-            archive.writestr(f"agent_{number}.zip", file.read_bytes())
+    parts = {f"agent_{number}.zip": file.read_bytes() for number, file in enumerate(files)}
+    parts[CALIBRATION] = json.dumps(content, indent=1).encode()
+    with zipfile.ZipFile(output, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(zipfile.ZipInfo(name), part, zipfile.ZIP_DEFLATED)
 
 
 def load_calibrated(path: Path, task: Task, price: float | None, trust: bool) -> CalibratedPolicy:

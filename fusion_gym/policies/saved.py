@@ -11,6 +11,7 @@ def saved_agent(
     path: str,
     deterministic: bool = True,
     price: float | None = None,
+    calibrated: bool = True,
     *,
     trust: bool = False,
 ) -> Policy:
@@ -21,6 +22,7 @@ def saved_agent(
         path: the file, with or without ``.zip``.
         deterministic: take the likeliest action instead of a draw.
         price: price of a token, for an agent that was trained for a range of prices.
+        calibrated: use the calibration of the file, if it has one, or the agent alone.
         trust: whether the file may run code; a text cannot set it.
 
     Raises:
@@ -35,16 +37,25 @@ def saved_agent(
         read_part(file, CALIBRATION)
     except ConfigurationError:
         return load_model_policy(path, task, deterministic, price, trust=trust)
-    if not deterministic:
+    if calibrated and not deterministic:
         raise refusal("deterministic", deterministic, "true for calibrated agents")
     try:
-        return load_calibrated(file, task, price, trust)
+        policy = load_calibrated(file, task, price, trust)
     except ConfigurationError as error:
         raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
+    if calibrated:
+        return policy
+    agent = policy.nearest_agent()
+    agent.deterministic = deterministic
+    return agent
 
 
 def zoo_agent(
-    task: Task, name: str, deterministic: bool = True, price: float | None = None
+    task: Task,
+    name: str,
+    deterministic: bool = True,
+    price: float | None = None,
+    calibrated: bool = True,
 ) -> Policy:
     """Request by an agent of the model zoo (:mod:`fusion_gym.zoo`).
 
@@ -53,9 +64,10 @@ def zoo_agent(
         name: name of the agent.
         deterministic: take the likeliest action instead of a draw.
         price: price of a token, for an agent that was trained for a range of prices.
+        calibrated: use the calibration, or the agent alone.
 
     Raises:
         ConfigurationError: no agent of that name, a file that differs from its card, or an agent
             that does not fit the task.
     """
-    return saved_agent(task, zoo.model_path(name), deterministic, price)
+    return saved_agent(task, zoo.model_path(name), deterministic, price, calibrated)
