@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,9 +48,16 @@ class CentrePrediction(NamedTuple):
 
 
 class Centre(Protocol):
-    """The interface of nodes and centre."""
+    """The interface of nodes and centre.
+
+    Attributes:
+        separable: Whether :meth:`single` is available, and faster than one update after another.
+        reads_silence: Whether a step without a delivery is information.
+    """
 
     filter: Any
+    separable: ClassVar[bool] = False
+    reads_silence: ClassVar[bool] = False
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -61,16 +68,6 @@ class Centre(Protocol):
     @property
     def predictable(self) -> bool:
         """Whether the covariances depend on the deliveries only."""
-        return False
-
-    @property
-    def separable(self) -> bool:
-        """Whether :meth:`single` is available, and faster than one update after another."""
-        return False
-
-    @property
-    def reads_silence(self) -> bool:
-        """Whether a step without a delivery is information."""
         return False
 
     @property
@@ -266,11 +263,7 @@ class FederatedCentre(NodeCentre):
     """
 
     filter: KalmanFilter
-
-    @property
-    def separable(self) -> bool:
-        """See :class:`Centre`."""
-        return True
+    separable = True
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` have no effect."""

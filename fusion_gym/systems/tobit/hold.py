@@ -48,11 +48,7 @@ class HoldCentre(Centre):
 
     filter: KalmanFilter
     plant: LinearPlant
-
-    @property
-    def numpy_only(self) -> str | None:
-        """See :class:`Centre`."""
-        return "filter"
+    numpy_only = "filter"
 
     @functools.cached_property
     def inverse(self) -> Array:

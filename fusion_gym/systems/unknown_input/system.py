@@ -83,6 +83,7 @@ class UnknownInputSystem(System[UnknownInputState]):
     reference: Array
     nature: Nature = AS_ASSUMED
     signals = SIGNALS
+    covariance_cycle = 1  # the recursion of the covariances does not depend on time
 
     @property
     def sensor_count(self) -> int:
@@ -114,11 +115,6 @@ class UnknownInputSystem(System[UnknownInputState]):
         if capability in ("imagine", "imagination_channels"):
             return self.signal.start_channels > 0
         return super().offers(capability)
-
-    @property
-    def covariance_cycle(self) -> int:
-        """1: the recursion of the covariances does not depend on time."""
-        return 1
 
     @property
     def observation(self) -> tuple[Block, ...]:
