@@ -82,6 +82,15 @@ def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: in
     return result
 
 
+def by_row(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
+    """Return one number per row as an array that broadcasts to ``shape``, other values as given."""
+    try:
+        values = np.asarray(value)
+    except ValueError:
+        return value
+    return values.reshape(-1, *[1] * (len(shape) - 1)) if values.shape == shape[:1] else value
+
+
 def number(
     field: str,
     value: Any,

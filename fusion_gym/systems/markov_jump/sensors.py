@@ -70,7 +70,7 @@ class FadingSensors:
         matrix = validation.array(
             "measurement_matrices", measurement_matrices, (None, plant.modes, plant.size)
         )
-        sensors, noises = len(matrix), len(plant.noise_covariance)
+        sensors = len(matrix)
         period = validation.spread("sampling_periods", sampling_periods, (sensors,))
         if np.any(period < 1.0) or np.any(period != np.round(period)):
             raise ConfigurationError(
@@ -84,6 +84,8 @@ class FadingSensors:
                 "0 to 1"
             )
         variance = validation.positive("measurement_variance", measurement_variance, (sensors,))
+        shape = (sensors, len(plant.noise_covariance))
+        coupling = validation.by_row(noise_coupling, shape)
         return cls(
             measurement_matrix=np.ascontiguousarray(matrix.transpose(0, 2, 1)),
             period=period.astype(np.int64)[:, None],
@@ -91,9 +93,7 @@ class FadingSensors:
             fading_probabilities=probabilities(
                 "fading_probabilities", fading_probabilities, values.shape
             ),
-            noise_coupling=validation.spread(
-                "noise_coupling", _column(noise_coupling, sensors), (sensors, noises)
-            )[..., None],
+            noise_coupling=validation.spread("noise_coupling", coupling, shape)[..., None],
             variance=variance[:, None],
             deviation=np.sqrt(variance)[:, None],
         )
@@ -145,12 +145,3 @@ class FadingSensors:
         result += linalg.dot(self.noise_coupling, process_noise)
         result += self.deviation * noise[self.count :]
         return result
-
-
-def _column(value: ArrayLike, sensors: int) -> ArrayLike:
-    """Return one number per sensor as a column over the noises, other values unchanged."""
-    try:
-        values = np.asarray(value)
-    except ValueError:
-        return value
-    return values[:, None] if values.shape == (sensors,) else value

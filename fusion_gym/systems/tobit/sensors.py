@@ -12,6 +12,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_limits
 from fusion_gym.namespace import namespace
+from fusion_gym.systems.linear_plant import Sensors
 from fusion_gym.validation import ConfigurationError
 
 _RIDGE = 4e-15  # relative, for each state: twice what linalg.root takes for rounding
@@ -19,7 +20,7 @@ _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in it
 
 
 @dataclass(frozen=True)
-class CensoredSensors:
+class CensoredSensors(Sensors):
     """y = clip(C x + v, τ, υ) by component, v ~ N(0, diag(R)), for several sensors of equal size.
 
     A component that a sensor does not have is always zero: its row of C and its ``noise_deviation``
@@ -98,21 +99,6 @@ class CensoredSensors:
             finite_upper=np.where(np.isposinf(high), 0.0, high)[..., None],
             two_sided=bool(np.isfinite(high).any()),
         )
-
-    @property
-    def count(self) -> int:
-        """Number of sensors."""
-        return self.measurement_matrix.shape[0]
-
-    @property
-    def size(self) -> int:
-        """Number of measured components m of each sensor."""
-        return self.measurement_matrix.shape[1]
-
-    @property
-    def noise_channels(self) -> int:
-        """Standard normals that one measurement of all sensors consumes."""
-        return self.count * self.size
 
     def measure(self, state: Array, noise: Array, departure: Array | None = None) -> Array:
         """Return the censored measurements (sensors, m, N).

@@ -168,7 +168,7 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
     weights = _weights(options, open_loop, plant.inputs)
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    plant.warn_of_unseen_growth(sensors.matrix, _state_names(options, plant))
+    plant.warn_of_unseen_growth(sensors.measurement_matrix, _state_names(options, plant))
     system = UnknownInputSystem(
         plant=plant,
         signal=signal,
