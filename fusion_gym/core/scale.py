@@ -18,7 +18,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.options import CommonOptions, Scenario, plain_options
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import TokenBucket
-from fusion_gym.errors import ConfigurationError, display
+from fusion_gym.errors import ConfigurationError, display, forbidden
 
 Build = Callable[[Any], Scenario]
 _RUNS, _STEPS, _SEED = 32, 200, 20_261_124
@@ -111,9 +111,8 @@ def prices_at(spent: Array, error: Array, tokens: Array) -> Array:
     """Return the slopes of the lower envelope where the best policy spends ``tokens``."""
     spent, error = _envelope(spent, error)
     if len(spent) < 3:
-        raise ConfigurationError(
-            "price_range = 'auto' is not allowed here: transmissions do not lower the error"
-        )
+        reason = "transmissions do not lower the error"
+        raise forbidden("price_range", "auto", reason, "here")
     middle = np.sqrt(spent[1:] * np.maximum(spent[:-1], 0.25 * spent[1]))
     slopes = np.log(np.diff(-error) / np.diff(spent))
     return np.exp(np.interp(np.log(tokens), np.log(middle), slopes))

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import SharingRule
+from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace, ranked_sum
 from fusion_gym.validation import ConfigurationError
 
@@ -95,10 +96,8 @@ class TokenBucket:
             )
         start = validation.number("initial_tokens", initial, at_least=0.0)
         if start > limit:
-            raise ConfigurationError(
-                f"initial_tokens = {start} is not allowed: with token_capacity = {limit:g} it must "
-                f"be >= 0 and <= {limit:g}"
-            )
+            reason = f"with token_capacity = {limit:g} it must be >= 0 and <= {limit:g}"
+            raise forbidden("initial_tokens", start, reason)
         return cls(
             rate=validation.number("token_rate", rate, at_least=0.0),
             capacity=limit,

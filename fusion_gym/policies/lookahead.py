@@ -72,10 +72,9 @@ class Lookahead:
         self.steps = validation.integer("steps", steps, at_least=1, at_most=validation.MOST_STEPS)
         self.price = validation.number("price", price, at_least=0.0)
         if task.information != "sensors":
-            raise ConfigurationError(
-                f"information = {task.information!r} is not allowed with policy 'lookahead': it "
-                "must be 'sensors', because it reads new measurements"
-            )
+            where = "with policy 'lookahead'"
+            allowed = "'sensors', because it reads new measurements"
+            raise validation.refusal("information", task.information, allowed, where)
         self._task = task
         self.greedy = task.sensors > _MOST_TOGETHER and task.access != "single"
         if self.greedy and task.sensors > _MOST_GREEDY:

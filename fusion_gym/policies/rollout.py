@@ -99,16 +99,12 @@ class Rollout:
             raise validation.refusal("base", base, "the text that names a policy")
         self.base: Policy = make_policy(base, task, trust=trust)
         if not is_stateless(self.base):
-            raise validation.refusal(
-                "base",
-                base,
-                "a policy that reads only signals of the present step, because simulated "
-                "episodes call it",
-            )
+            why = "because simulated episodes call it"
+            allowed = f"a policy that reads only signals of the present step, {why}"
+            raise validation.refusal("base", base, allowed)
         if owner_of(self.base) == "own":
-            raise validation.refusal(
-                "base", base, "a scheduler's policy, because simulations begin with its belief"
-            )
+            allowed = "a scheduler's policy, because simulations begin with its belief"
+            raise validation.refusal("base", base, allowed)
         memory = Memory(task, "scheduler")
         self._task = task
         self._decision = guard(self.base, task)

@@ -7,9 +7,9 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.core.system import Signals
+from fusion_gym.errors import forbidden
 from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
 from fusion_gym.policies.belief_rule import BeliefRule
-from fusion_gym.validation import ConfigurationError
 
 
 def _optional(name: str, value: float | None) -> None:
@@ -70,10 +70,8 @@ class ValueOfInformation(BeliefRule):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.threshold is not None and self.price is not None:
-            raise ConfigurationError(
-                f"price = {self.price} is not allowed with threshold = {self.threshold}: leave "
-                "one of them out"
-            )
+            reason = "leave one of them out"
+            raise forbidden("price", self.price, reason, f"with threshold = {self.threshold}")
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.errors import forbidden
 from fusion_gym.fusion.rules import FusionRule, InformationFusion
 from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.linear_plant import LinearPlant
@@ -22,7 +23,6 @@ from fusion_gym.systems.tobit.filters import (
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError
 
 Gaussian = tuple[Array, Array]  # mean (…, n, N) and covariance (…, n, n, N)
 Packets = NDArray[np.bool_]
@@ -159,10 +159,8 @@ class Feedback:
             return cls(np.full((sensors, 1), 1.0 / sensors))
         weights = validation.array("information_shares", share, (sensors,))
         if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
-            raise ConfigurationError(
-                f"information_shares = {validation.display(weights)} is not allowed: they must be "
-                f"> 0 with sum 1 (their sum is {weights.sum():.6g})"
-            )
+            reason = f"they must be > 0 with sum 1 (their sum is {weights.sum():.6g})"
+            raise forbidden("information_shares", weights, reason)
         return cls(weights[:, None])
 
 

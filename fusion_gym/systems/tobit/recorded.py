@@ -419,9 +419,8 @@ def _windows(plant: LinearPlant, part: _Part, horizon: int) -> WindowNoise:
     present = np.array([known[first : first + horizon + 1].mean() for first in starts])
     starts = starts[present >= _READINGS * known.mean()]
     if not len(starts):
-        raise refusal(
-            "horizon", horizon, f"shorter: {len(path):,} steps of the log were not fitted"
-        )
+        allowed = f"shorter: {len(path):,} steps of the log were not fitted"
+        raise refusal("horizon", horizon, allowed)
     root = plant.initial_factor[..., 0]
     moved = (path[starts] - plant.initial_mean[:, 0]) @ np.linalg.pinv(root).T
     still, day = np.zeros_like(moved), part.day[rows:][starts, None]

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_limits
+from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import Sensors
-from fusion_gym.validation import ConfigurationError
 
 _RIDGE = 4e-15  # relative, for each state: twice what linalg.root takes for rounding
 _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in its rounding
@@ -80,10 +80,8 @@ class CensoredSensors(Sensors):
         low = validation.spread("censoring_threshold", threshold, shape, infinity=-1)
         high = validation.spread("censoring_upper", upper, shape, infinity=1)
         if np.any(low >= high):
-            raise ConfigurationError(
-                f"censoring_threshold = {validation.display(low)} is not allowed: each must be "
-                f"below censoring_upper = {validation.display(high)}"
-            )
+            reason = f"each must be below censoring_upper = {validation.display(high)}"
+            raise forbidden("censoring_threshold", low, reason)
         uncensored = np.isneginf(low)
         noise = validation.positive("measurement_variance", variance, shape)[..., None]
         here = np.ones(shape) if present is None else np.where(present, 1.0, 0.0)
