@@ -57,16 +57,14 @@ class CorrelatedSensors(Sensors):
         Raises:
             ConfigurationError: a wrong shape, a variance <= 0, or an entry that is not finite.
         """
-        matrix = validation.array("measurement_matrices", measurement_matrices, (None, None, None))
-        matrix = validation.array(
-            "measurement_matrices", measurement_matrices, (*matrix.shape[:2], plant.size)
-        )
+        shape = (None, None, plant.size)
+        matrix = validation.array("measurement_matrices", measurement_matrices, shape)
         sensors, size, _ = matrix.shape
-        shape = (sensors, size, len(process_deviation))
-        given = validation.by_row(measurement_variance, shape[:2])
-        variance = validation.positive("measurement_variance", given, shape[:2])
-        given = validation.by_row(noise_coupling, shape)
-        beta = validation.spread("noise_coupling", given, shape)
+        given = validation.by_row(measurement_variance, (sensors, size))
+        variance = validation.positive("measurement_variance", given, (sensors, size))
+        shares = (sensors, size, len(process_deviation))
+        given = validation.by_row(noise_coupling, shares)
+        beta = validation.spread("noise_coupling", given, shares)
         coupling = (beta * process_deviation)[..., None]
         shared = linalg.matmul(coupling[:, None], linalg.transpose(coupling)[None])
         own = variance[:, None, :, None] * np.eye(size) * np.eye(sensors)[:, :, None, None]

@@ -51,8 +51,7 @@ class InputSensors(Sensors):
             ConfigurationError: a wrong shape, a V_i that is not positive definite, or a sensor that
                 cannot observe the input: rank(C_i ℬ) below the number of inputs.
         """
-        c = validation.array("measurement_matrices", matrices, (None, None, None))
-        c = validation.array("measurement_matrices", matrices, (*c.shape[:2], plant.size))
+        c = validation.array("measurement_matrices", matrices, (None, None, plant.size))
         noise = _noise_covariances(covariances, *c.shape[:2])
         inverses, complements = [], []
         for sensor, matrix in enumerate(c):
