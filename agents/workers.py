@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 import joblib
 
 from agents.cache import Cache
+from fusion_gym.errors import forbidden
 from fusion_gym.output.ending import name_user_code
 from fusion_gym.output.folders import fingerprint
 from fusion_gym.output.progress import progress_bar
@@ -41,10 +42,7 @@ class Pool:
 
     def __post_init__(self) -> None:
         if self.address is not None and self.backend == "loky":
-            raise ConfigurationError(
-                f"address = {self.address!r} is not allowed with backend='loky': it belongs to "
-                "'dask'"
-            )
+            raise forbidden("address", self.address, "it belongs to 'dask'", "with backend='loky'")
 
     @property
     def local(self) -> bool:
@@ -65,10 +63,8 @@ class Pool:
                     stack.enter_context(self._client())
                 except (OSError, ValueError) as error:
                     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                    raise ConfigurationError(
-                        f"address = {self.address!r} is not allowed with backend={self.backend!r}: "
-                        f"{reason}"
-                    ) from None
+                    where = f"with backend={self.backend!r}"
+                    raise forbidden("address", self.address, reason, where) from None
             jobs = self.workers if self.local else -1
             stack.enter_context(joblib.parallel_config(self.backend, n_jobs=jobs))
             yield
@@ -77,10 +73,8 @@ class Pool:
         try:
             from distributed import Client
         except ImportError:
-            raise ConfigurationError(
-                "backend = 'dask' is not allowed: it needs distributed, which 'fusion-gym[dask]' "
-                "installs"
-            ) from None
+            reason = "it needs distributed, which 'fusion-gym[dask]' installs"
+            raise forbidden("backend", "dask", reason) from None
         if self.address is None:
             return Client(n_workers=self.workers, threads_per_worker=1)
         return Client(address=self.address, timeout=_PATIENCE)

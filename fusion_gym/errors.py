@@ -43,10 +43,15 @@ class DivergenceError(FloatingPointError):
     """A number of a run that is not finite; the message names run, step and quantity."""
 
 
-def refusal(field: str, value: Any, allowed: str, where: str = "") -> ConfigurationError:
+def forbidden(field: str, value: Any, reason: str, where: str = "") -> ConfigurationError:
     """Return the error of a field whose value is not allowed, in general or only ``where``."""
     refused = f"{field} = {display(value)} is not allowed {where}".rstrip()
-    return ConfigurationError(f"{refused}: it must be {allowed}")
+    return ConfigurationError(f"{refused}: {reason}")
+
+
+def refusal(field: str, value: Any, allowed: str, where: str = "") -> ConfigurationError:
+    """Return the error of a field that must be something else."""
+    return forbidden(field, value, f"it must be {allowed}", where)
 
 
 def display(value: Any) -> str:

@@ -12,6 +12,7 @@ from contextvars import ContextVar
 from types import ModuleType
 from typing import Any
 
+from fusion_gym.errors import forbidden
 from fusion_gym.validation import ConfigurationError, nested
 
 TRUST: ContextVar[bool] = ContextVar("trust", default=False)
@@ -45,10 +46,8 @@ def imported(field: str, text: str, module: str) -> ModuleType:
         return importlib.import_module(module)
     except Exception as error:  # a user's module may raise any exception
         reason = f"{type(error).__name__}: {error}"
-        raise ConfigurationError(
-            f"{field} = {text!r} is not allowed: the module {module!r} cannot be imported "
-            f"({reason})"
-        ) from error
+        reason = f"the module {module!r} cannot be imported ({reason})"
+        raise forbidden(field, text, reason) from error
 
 
 def import_named(field: str, text: str) -> Any:
@@ -58,9 +57,7 @@ def import_named(field: str, text: str) -> Any:
         raise ConfigurationError(f"{field} = {text!r} is not allowed: it must be 'module:name'")
     result = imported(field, text, module)
     if not hasattr(result, name):
-        raise ConfigurationError(
-            f"{field} = {text!r} is not allowed: the module {module!r} has no {name!r}"
-        )
+        raise forbidden(field, text, f"the module {module!r} has no {name!r}")
     return getattr(result, name)
 
 

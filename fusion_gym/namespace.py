@@ -157,28 +157,11 @@ def ranked_sum(values: Any, place: Any) -> Any:
     """Return for each entry (rows, N) the sum of a run's entries up to its place, a permutation."""
     xp = namespace(values, place)
     if xp is not np:
-        return take_rows(xp.cumsum(permute(values, place), axis=0), place)
+        ordered = xp.take_along_axis(values, xp.argsort(place, axis=0), axis=0)
+        return xp.take_along_axis(xp.cumsum(ordered, axis=0), place, axis=0)
     total, place = np.empty(values.shape), place * values.shape[1] + np.arange(values.shape[1])
     total.reshape(-1)[place] = values
     return np.cumsum(total, axis=0).take(place)
-
-
-def permute(values: Any, place: Any) -> Any:
-    """Return (rows, N) with entry i of each run at row ``place[i]``, a permutation (rows, N)."""
-    xp = namespace(values, place)
-    if xp is not np:
-        return xp.take_along_axis(values, xp.argsort(place, axis=0), axis=0)
-    result = np.empty(values.shape, values.dtype)
-    result.reshape(-1)[place * values.shape[1] + np.arange(values.shape[1])] = values
-    return result
-
-
-def take_rows(values: Any, place: Any) -> Any:
-    """Return the entries (rows, N) of ``values`` at the rows ``place`` (rows, N) of each run."""
-    xp = namespace(values, place)
-    if xp is not np:
-        return xp.take_along_axis(values, place, axis=0)
-    return values.take(place * values.shape[1] + np.arange(values.shape[1]))
 
 
 def ndtr(z: Any) -> Any:

@@ -82,6 +82,15 @@ def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: in
     return result
 
 
+def by_row(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
+    """Return one number per row as an array that broadcasts to ``shape``, other values as given."""
+    try:
+        values = np.asarray(value)
+    except ValueError:
+        return value
+    return values.reshape(-1, *[1] * (len(shape) - 1)) if values.shape == shape[:1] else value
+
+
 def number(
     field: str,
     value: Any,
@@ -224,13 +233,11 @@ def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = Fals
     smallest = float(np.linalg.eigvalsh(matrix)[0])
     scale = float(np.abs(matrix).max())
     if definite and smallest <= max(1e-14 * scale, SMALLEST**2):
-        raise refusal(
-            field, matrix, f"positive definite (its smallest eigenvalue is {smallest:.3g})"
-        )
+        allowed = f"positive definite (its smallest eigenvalue is {smallest:.3g})"
+        raise refusal(field, matrix, allowed)
     if smallest < -1e-12 * scale or (np.diagonal(matrix) < 0.0).any():
-        raise refusal(
-            field, matrix, f"positive semi-definite (its smallest eigenvalue is {smallest:.3g})"
-        )
+        allowed = f"positive semi-definite (its smallest eigenvalue is {smallest:.3g})"
+        raise refusal(field, matrix, allowed)
     return (matrix + matrix.T) / 2
 
 
@@ -284,9 +291,8 @@ def adaptive_thresholds(rho_bar: ArrayLike, rho_initial: ArrayLike, adaptation: 
         raise refusal("rho_bar", rho_bar, ">= 0 and <= 1")
     initial = not_negative("rho_initial", rho_initial, parameter_shape(rho_initial))
     if initial.ndim == limit.ndim == 1 and len(initial) != len(limit):
-        raise refusal(
-            "rho_initial", rho_initial, f"a number, or as many as rho_bar = {display(rho_bar)} has"
-        )
+        allowed = f"a number, or as many as rho_bar = {display(rho_bar)} has"
+        raise refusal("rho_initial", rho_initial, allowed)
     if np.any(initial > limit):
         raise refusal("rho_initial", rho_initial, f"<= rho_bar = {display(rho_bar)}")
     positive("adaptation", adaptation, parameter_shape(adaptation))

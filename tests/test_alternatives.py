@@ -18,7 +18,7 @@ from fusion_gym.validation import ConfigurationError
 OSCILLATOR = "fusion_gym/TobitOscillator-v1"
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": (OSCILLATOR, {"horizon": 6}),
-    "starved": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "rotating"}),
+    "starved": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "fixed"}),
     "queue": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "turns"}),
     "memory": (OSCILLATOR, {"filter": "tobit", "memory": True, "horizon": 5}),
     "estimates": (OSCILLATOR, {"filter": "tobit", "memory": True, "packet": "estimate"}),
@@ -106,7 +106,7 @@ def test_grants_of_many_sensors_are_reported_apart(sensors: int) -> None:
 
 def test_requests_that_are_answered_alike_are_stepped_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody is granted anything without tokens, and what was taken is known already."""
-    task = fusion_gym.make_task(OSCILLATOR, token_rate=0.5, initial_tokens=3.0, sharing="rotating")
+    task = fusion_gym.make_task(OSCILLATOR, token_rate=0.5, initial_tokens=3.0, sharing="fixed")
     batch = EpisodeBatch.seeded(task, 2, 0)
     counted: list[int] = []
     take = Branch.step

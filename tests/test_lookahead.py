@@ -101,7 +101,7 @@ def test_its_limits() -> None:
 
 
 def test_it_asks_only_for_what_the_network_grants() -> None:
-    task = fusion_gym.make_task(TOBIT, filter="tobit", token_rate=1.0, sharing="rotating")
+    task = fusion_gym.make_task(TOBIT, filter="tobit", token_rate=1.0, sharing="fixed")
     results = run_episodes(task, Lookahead(task, price=1e-4), 20, seed=0)
     assert results.rate.mean() > 0.05
     assert results.denied.max() == 0.0

@@ -40,7 +40,7 @@ def test_a_masked_agent_is_never_denied(env_id: str, tmp_path: Any) -> None:
     options: dict[str, Any] = {
         "tokens": "limited",
         "token_rate": 1.0,
-        "sharing": "rotating",
+        "sharing": "fixed",
         "token_capacity": 9.0,
     }
     options["initial_tokens"] = 6.0

@@ -121,7 +121,7 @@ TASKS: list[tuple[str, dict[str, Any]]] = [
     ("BiasedOscillator-v1", {"access": "round_robin"}),
     ("BiasedTracking-v1", {"access": "random", "clock": True}),
     ("LinearFusion-v2", {"price_range": (0.1, 1.0), "cost_weight": "random"}),
-    ("LinearFusion-v2", {"filter": "joint", "sharing": "rotating"}),
+    ("LinearFusion-v2", {"filter": "joint", "sharing": "fixed"}),
     ("LinearFusion-v2", {"initial_covariance": [[0.0, 0.0], [0.0, 1.0]], "action": "discrete"}),
     ("RemoteEstimation-v1", {"sensors": 3, "tokens": "limited", "sharing": "fixed"}),
     ("RemoteEstimation-v1", {"sensors": 2, "channel": "gilbert_elliott"}),

@@ -146,7 +146,7 @@ def test_brute_force_of_fused_input_nodes() -> None:
             for node in range(3):
                 prior = forward @ nodes[node] @ forward.T + model.change[..., 0]
                 if schedules[step % 2, node, number]:
-                    matrix = np.hstack((sensors.matrix[node, ..., 0], np.zeros((2, 1))))
+                    matrix = np.hstack((sensors.measurement_matrix[node, ..., 0], np.zeros((2, 1))))
                     noise = sensors.covariance[node, ..., 0]
                     information = matrix.T @ np.linalg.inv(noise) @ matrix
                     prior = np.linalg.inv(np.linalg.inv(prior) + information)

@@ -120,7 +120,7 @@ def walk(
         time = {"step": steps, "start": steps == 0}
         signals = Signals(dict(system.read(state)) | network | time)
         request = policy(signals) if requests is None else requests[step]
-        granted, _, tokens, _ = task.bucket.grant(tokens, request, steps)
+        granted, _, tokens, _ = task.bucket.grant(tokens, request)
         state = system.deliver(state, granted)
         estimates = (*system.fused(state), system.local_means(state))
         rows.append(

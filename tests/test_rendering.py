@@ -42,7 +42,7 @@ def test_every_environment_draws_its_episode(env_id: str) -> None:
 def test_a_picture_shows_what_happened() -> None:
     """Ticks of requests that were granted and denied, in their colours; the censored region."""
     env: Any = gym.make(
-        TOBIT, render_mode="rgb_array", initial_tokens=3.0, token_rate=0.0, sharing="rotating"
+        TOBIT, render_mode="rgb_array", initial_tokens=3.0, token_rate=0.0, sharing="fixed"
     )
 
     def has(colour: tuple[int, int, int]) -> bool:

@@ -262,7 +262,7 @@ def test_joint_optimum_lies_between_the_dual_bound_and_the_best_schedule(drop: f
 
 
 def test_dual_bound_of_an_episode() -> None:
-    bucket = TokenBucket.create(0.5, 4.0, 2.0, 1.0, sensors=2, sharing="rotating")
+    bucket = TokenBucket.create(0.5, 4.0, 2.0, 1.0, sensors=2, sharing="fixed")
     sources = (SourceProblem.create(price=0.5), SourceProblem.create(price=0.5, coefficient=0.8))
     joint = solve_joint_finite(JointProblem.create(sources, bucket), 30)
     bound = lagrangian_bound(sources, (1.0, 1.0), 0.5, horizon=30, initial_tokens=2.0)

@@ -24,7 +24,6 @@ def scalar_step(
     rate: float,
     capacity: float,
     sharing: str,
-    step: int,
     queue: list[int],
 ) -> tuple[list[bool], float, float]:
     """(16)-(18), and the rules that serve one sensor after another, in plain Python.
@@ -37,12 +36,8 @@ def scalar_step(
         for m in range(sensors):
             granted[m] = requests[m] and costs[m] <= tokens / sensors
     else:
-        order = list(range(sensors))
-        if sharing == "rotating":
-            turn = step % sensors
-            order = order[turn:] + order[:turn]
         left = tokens
-        for m in list(queue) if sharing == "turns" else order:
+        for m in list(queue) if sharing == "turns" else range(sensors):
             if requests[m] and costs[m] <= left:
                 granted[m] = True
                 left -= costs[m]
@@ -87,8 +82,8 @@ def test_random_buckets_agree_with_the_scalar_loop(bucket: TokenBucket, seed: in
     costs = bucket.cost[:, 0].tolist()
     queues = [list(range(len(costs))) for _ in range(3)]
     queue = bucket.start_queue(3)
-    for number, request in enumerate(requests):
-        answer = bucket.grant(tokens, request, np.full(3, number), queue)
+    for request in requests:
+        answer = bucket.grant(tokens, request, queue)
         for run in range(3):
             granted, spent, left = scalar_step(
                 tokens[run],
@@ -97,7 +92,6 @@ def test_random_buckets_agree_with_the_scalar_loop(bucket: TokenBucket, seed: in
                 bucket.rate,
                 bucket.capacity,
                 bucket.sharing,
-                number,
                 queues[run],
             )
             assert answer.granted[:, run].tolist() == granted
@@ -114,8 +108,8 @@ def test_turns_favour_nobody_who_requests_alike(bucket: TokenBucket, seed: int, 
     requests = random_requests(bucket, runs, steps, seed)
     requests[:, 1] = requests[:, 0]
     tokens, queue, ahead = bucket.start(runs), bucket.start_queue(runs), [np.zeros(runs)]
-    for number, request in enumerate(requests):
-        answer = bucket.grant(tokens, request, np.full(runs, number), queue)
+    for request in requests:
+        answer = bucket.grant(tokens, request, queue)
         tokens, queue = answer.tokens, answer.queue
         ahead.append(ahead[-1] + answer.granted[0] - answer.granted[1])
     assert np.ptp(ahead, axis=0).max() <= 1
@@ -132,7 +126,7 @@ def test_the_round_robin_rule_passes_its_turn_when_granted(
     for step in np.arange(60)[:, None]:
         request = rule(Signals({"queue": queue, "step": step}))
         assert request.sum() == (step[0] % period == 0)
-        granted, _, tokens, queue = bucket.grant(tokens, request, step, queue)
+        granted, _, tokens, queue = bucket.grant(tokens, request, queue)
         served += np.flatnonzero(granted).tolist()
     assert served == [number % len(bucket.cost) for number in range(len(served))]
 
@@ -147,10 +141,9 @@ def test_a_run_is_answered_alone_as_in_a_batch(sensors: int, seed: int, sharing:
     cost = generator.random(sensors) + 0.1
     bucket = TokenBucket.create(0.3, 25.0, 9.0, cost, sensors, sharing)
     tokens, queue = bucket.start(5), bucket.start_queue(5)
-    for step, request in enumerate(random_requests(bucket, 5, 8, seed)):
-        number = np.full(5, step)
-        answer = bucket.grant(tokens, request, number, queue)
-        alone = bucket.grant(tokens[3:4], request[:, 3:4], number[3:4], queue[:, 3:4])
+    for request in random_requests(bucket, 5, 8, seed):
+        answer = bucket.grant(tokens, request, queue)
+        alone = bucket.grant(tokens[3:4], request[:, 3:4], queue[:, 3:4])
         for one, every in zip(alone, answer, strict=True):
             np.testing.assert_array_equal(one[..., 0], every[..., 3])
         assert (np.sort(answer.queue, axis=0) == np.arange(sensors)[:, None]).all()
@@ -170,7 +163,7 @@ def test_round_robin_access_resonates_where_grants_differ(sensors: int) -> None:
     tokens, grants, rounds = bucket.start(len(rate)), 0.0 * every["cost"], 480
     for step in range(rounds * sensors):
         request = (np.arange(sensors) == step % sensors)[:, None] & (cost > 0.0)
-        granted, _, tokens, _ = bucket.grant(tokens, request, step + 0 * numbers)
+        granted, _, tokens, _ = bucket.grant(tokens, request)
         grants += granted * (step >= rounds * sensors // 2)
     resonates = [dataclasses.replace(own, sharing="fixed").resonates for own in single]
     np.testing.assert_array_equal(resonates, np.ptp(grants, axis=0) > 3)
@@ -189,7 +182,7 @@ def test_no_turn_is_lost_in_the_end_unless_cheaper_sensors_are_favoured(
     tokens, grants, rounds = bucket.start(1), np.zeros(sensors), 4 * sensors + 4
     for step in range(rounds * sensors):
         request = (np.arange(sensors) == step % sensors)[:, None]
-        granted, _, tokens, _ = bucket.grant(tokens, request, np.full(1, step))
+        granted, _, tokens, _ = bucket.grant(tokens, request)
         grants += granted[:, 0] * (step >= rounds * sensors // 2)
     if min(costs) < max(costs):
         assert bucket.favours_cheaper or (grants == rounds // 2).all()
@@ -223,8 +216,8 @@ def test_limits_hold_for_any_numbers_up_to_rounding(
     capacity = 1.5 * sensors * cost
     bucket = TokenBucket.create(rate, capacity, capacity, cost, sensors)
     tokens = bucket.start(2)
-    for number, requests in enumerate(random_requests(bucket, 2, 20, seed)):
-        answer = bucket.grant(tokens, requests, np.full(2, number))
+    for requests in random_requests(bucket, 2, 20, seed):
+        answer = bucket.grant(tokens, requests)
         assert np.all(answer.spent <= tokens * (1 + 1e-14))
         assert np.all(answer.tokens >= -1e-14 * capacity)
         assert np.all(answer.tokens <= capacity)
@@ -236,7 +229,7 @@ def test_limits_hold_for_any_numbers_up_to_rounding(
 def test_unlimited_grants_everything_and_counts_it(bucket: TokenBucket, seed: int) -> None:
     requests = random_requests(bucket, 4, 1, seed)[0]
     tokens = bucket.start(4)
-    answer = bucket.grant(tokens, requests, np.zeros(4, dtype=np.int64))
+    answer = bucket.grant(tokens, requests)
     assert np.array_equal(answer.granted, requests)
     assert np.array_equal(answer.spent, requests.T.astype(float) @ bucket.cost[:, 0])
     assert answer.tokens.tolist() == [bucket.capacity] * 4
@@ -246,7 +239,7 @@ def test_unlimited_grants_everything_and_counts_it(bucket: TokenBucket, seed: in
 
 def test_an_unlimited_bucket_needs_no_capacity_for_a_transmission() -> None:
     bucket = TokenBucket.create(0.0, 1.0, 1.0, 3.0, 3, unlimited=True)
-    answer = bucket.grant(bucket.start(1), np.ones((3, 1), dtype=np.bool_), np.array([0]))
+    answer = bucket.grant(bucket.start(1), np.ones((3, 1), dtype=np.bool_))
     assert answer.granted.all()
 
 
@@ -285,11 +278,11 @@ def test_tokens_that_add_up_pay_for_a_transmission(sharing: str) -> None:
     bucket = TokenBucket.create(
         rate=0.1, capacity=2.0, initial=0.0, cost=1.0, sensors=1, sharing=sharing
     )
-    tokens, step = bucket.start(1), np.zeros(1, dtype=np.int64)
+    tokens = bucket.start(1)
     for _ in range(10):
-        granted, spent, tokens, _ = bucket.grant(tokens, np.zeros((1, 1), dtype=np.bool_), step)
+        granted, spent, tokens, _ = bucket.grant(tokens, np.zeros((1, 1), dtype=np.bool_))
         assert not granted.any()
         assert spent[0] == 0.0
-    granted, spent, tokens, _ = bucket.grant(tokens, np.ones((1, 1), dtype=np.bool_), step)
+    granted, spent, tokens, _ = bucket.grant(tokens, np.ones((1, 1), dtype=np.bool_))
     assert granted.all()
     assert tokens[0] >= 0.0

@@ -69,7 +69,7 @@ def test_gain_hides_the_input_and_is_the_textbooks(seed: int, q: int, size: int)
     joint = JointGain.create(plant, sensors)
     phi = random_covariances(seed, (3,), 4, 2)
     gain = joint.gain(phi, sensors.covariance)
-    observed = linalg.matmul(sensors.matrix, plant.input_matrix)
+    observed = linalg.matmul(sensors.measurement_matrix, plant.input_matrix)
     through = linalg.matmul(gain, observed)
     scale = np.abs(gain).max()
     np.testing.assert_allclose(
@@ -81,7 +81,7 @@ def test_gain_hides_the_input_and_is_the_textbooks(seed: int, q: int, size: int)
     for sensor in range(3):
         n, left = textbook_gain(
             plant,
-            sensors.matrix[sensor, ..., 0],
+            sensors.measurement_matrix[sensor, ..., 0],
             phi[sensor, ..., 1],
             sensors.covariance[sensor, ..., 0],
         )
@@ -124,10 +124,11 @@ def test_paper_gain_is_exact_to_rounding() -> None:
     )
     joint = JointGain.create(plant, sensors)
     gain = joint.gain(random_covariances(0, (2,), 2, 1), sensors.covariance)
-    through = linalg.matmul(gain, linalg.matmul(sensors.matrix, plant.input_matrix))[..., 0]
+    observed = linalg.matmul(sensors.measurement_matrix, plant.input_matrix)
+    through = linalg.matmul(gain, observed)[..., 0]
     residual = through - np.concatenate((plant.input_matrix[..., 0], np.eye(2)))
     assert np.abs(residual).max() < 3e-11
-    retention = linalg.identity(2) - linalg.matmul(gain[:, :2], sensors.matrix)
+    retention = linalg.identity(2) - linalg.matmul(gain[:, :2], sensors.measurement_matrix)
     assert np.abs(retention).max() < 1e-9  # N C = I: the estimate has no memory
 
 
@@ -183,7 +184,7 @@ def test_bound_tables_are_the_recursion_with_explicit_inverses() -> None:
     tables = BoundTables.create(joint, model, limit, epsilon, 12)
     a = plant.transition[..., 0]
     for sensor in range(2):
-        c, v = sensors.matrix[sensor, ..., 0], sensors.covariance[sensor, ..., 0]
+        c, v = sensors.measurement_matrix[sensor, ..., 0], sensors.covariance[sensor, ..., 0]
         e, xi = epsilon[sensor], plant.initial_covariance[..., 0]
         noise = (1 + e) * v + (1 + 1 / e) * limit[sensor] * np.eye(3)
         for time in range(1, 13):

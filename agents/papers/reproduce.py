@@ -37,10 +37,11 @@ from agents.papers.paper import (
 from agents.workers import Call, Pool, run_parallel
 from fusion_gym.commands.command_line import Command, SetOptions
 from fusion_gym.commands.options import OutputFolder, Seed, Whole
+from fusion_gym.errors import forbidden, refusal
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.folders import lock_folder
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.validation import ConfigurationError, integer
+from fusion_gym.validation import integer
 
 
 @dataclass(frozen=True)
@@ -76,16 +77,12 @@ class Reproduce(Command):
         changes = parse_settings("option", itertools.chain(*self.options))
         if self.figure is not None:
             if len(papers) != 1:
-                raise ConfigurationError(
-                    f"papers = {self.papers!r} is not allowed with figure = {self.figure!r}: "
-                    "it must be a single paper"
-                )
+                allowed = "a single paper"
+                raise refusal("papers", self.papers, allowed, f"with figure = {self.figure!r}")
             self._reproduce_figure(papers[0], self.figure, changes)
         elif changes:
-            raise ConfigurationError(
-                f"set = {next(iter(changes))!r} is not allowed without --figure: the claims of "
-                "the pages need the papers' parameters"
-            )
+            reason = "the claims of the pages need the papers' parameters"
+            raise forbidden("set", next(iter(changes)), reason, "without --figure")
         else:
             self._reproduce_pages(papers, self.output or Path("docs/reproduction"))
 

@@ -48,7 +48,7 @@ def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Mo
     n = plant.size
     lifted = (plant.transition, plant.input_matrix, plant.process_covariance)
     start = (model.initial_mean[:n, 0], model.initial_covariance[:n, :n, 0])
-    measured = zip(sensors.matrix[..., 0], sensors.covariance[..., 0], strict=True)
+    measured = zip(sensors.measurement_matrix[..., 0], sensors.covariance[..., 0], strict=True)
     a, b, w = (matrix[..., 0] for matrix in lifted)
     return [Model(a, b, w, c, v, factor, rho_bar, *start) for c, v in measured]
 
@@ -133,11 +133,11 @@ def decoupling(paper: UnknownInputSystem, every_step: UnknownInputSystem) -> dic
     single = every_step.plant
     a, b = single.transition[..., 0], single.input_matrix[..., 0]
     lifted = block_diag(np.hstack((a @ b, b)), np.hstack((b, 0.0 * b)))
-    c = paper.nodes.sensors.matrix[0, ..., 0]
-    observed = np.hstack((c, 0.0 * c)) @ lifted
+    each = paper.nodes.sensors.measurement_matrix[..., 0]
+    observed = np.hstack((each[0], 0.0 * each[0])) @ lifted
     return {
         "rank": int(np.linalg.matrix_rank(observed)), "columns": int(observed.shape[1]),
-        "conditions": [float(np.linalg.cond(m)) for m in (*paper.nodes.sensors.matrix[..., 0], b)],
+        "conditions": [float(np.linalg.cond(m)) for m in (*each, b)],
         "floor": _floor(paper),
     }  # fmt: skip
 
@@ -147,7 +147,7 @@ def _floor(system: UnknownInputSystem) -> list[list[float]]:
     b = system.plant.input_matrix[..., 0]
     result = []
     sensors = system.nodes.sensors
-    for c, v in zip(sensors.matrix[..., 0], sensors.covariance[..., 0], strict=True):
+    for c, v in zip(sensors.measurement_matrix[..., 0], sensors.covariance[..., 0], strict=True):
         spread = np.linalg.inv(c) @ v @ np.linalg.inv(c).T
         a, w = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
         into = np.linalg.inv(b)

@@ -17,6 +17,7 @@ from fusion_gym import zoo
 from fusion_gym.commands.command_line import Command, EnvironmentOptions
 from fusion_gym.commands.options import OutputFile
 from fusion_gym.envs.registration import make_task
+from fusion_gym.errors import forbidden
 from fusion_gym.importing import require
 from fusion_gym.output.files import replacing
 from fusion_gym.policies.registry import make_policy
@@ -98,10 +99,8 @@ def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, 
             return trained["id"], trained["options"] | own
         config_file = Path(name).parent / "config.yaml"
         if not config_file.is_file():
-            raise ConfigurationError(
-                f"env = None is not allowed with model = {command.model!r}, whose folder has no "
-                "config.yaml: give --env ID or --config FILE"
-            )
+            where = f"with model = {command.model!r}, whose folder has no config.yaml"
+            raise forbidden("env", None, "give --env ID or --config FILE", where)
         config = str(config_file)
     env_id, options, _ = environment_of(command.env, config, command.options)
     return env_id, options

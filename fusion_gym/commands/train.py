@@ -28,6 +28,7 @@ from typing import Annotated
 
 from fusion_gym.commands.command_line import Long, SetOptions
 from fusion_gym.commands.options import OutputFolder, Steps, TrainingSeed, writable_folder
+from fusion_gym.errors import forbidden
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.training.checked import load_checked, parse
 from fusion_gym.training.config import Experiment
@@ -70,15 +71,12 @@ class Train(Long):
     def _base_experiment(self) -> Experiment:
         """Return the config, or the default config of ``env`` and ``algorithm``."""
         if (self.config is None) == (self.env is None):
-            raise ConfigurationError(
-                f"config = {self.config!r} is not allowed with env = {self.env!r}: give one of them"
-            )
+            raise forbidden("config", self.config, "give one of them", f"with env = {self.env!r}")
         if self.config is not None:
             if self.algorithm is not None:
-                raise ConfigurationError(
-                    f"algorithm = {self.algorithm!r} is not allowed with config = "
-                    f"{self.config!r}: the config names the algorithm"
-                )
+                where = f"with config = {self.config!r}"
+                reason = "the config names the algorithm"
+                raise forbidden("algorithm", self.algorithm, reason, where)
             return load_checked(Experiment, self.config)
         algorithm = self.algorithm or "ppo"
         name = re.sub(r"\W+", "_", f"{str(self.env).rpartition('/')[2]}_{algorithm}").lower()

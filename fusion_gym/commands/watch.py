@@ -19,13 +19,13 @@ from fusion_gym.commands.options import OutputFile, Seed, Whole
 from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Frame, Window
 from fusion_gym.envs.registration import make_task
+from fusion_gym.errors import forbidden
 from fusion_gym.evaluation.watching import watch
 from fusion_gym.importing import require
 from fusion_gym.output.films import ENDINGS, save_film
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.environment import environment_of
-from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,7 @@ class Watch(EnvironmentOptions, Long):
         task = make_task(env_id, **options)
         names = [self.policy] if self.against is None else [self.policy, self.against]
         if len(set(names)) < len(names):
-            raise ConfigurationError(
-                f"against = {self.against!r} is not allowed: it must differ from policy"
-            )
+            raise forbidden("against", self.against, "it must differ from policy")
         policies = {name: make_policy(name, task) for name in names}
         frames = watch(task, policies, self.seed, self.steps)
         if self.save is None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import System
-from fusion_gym.errors import ConfigurationError, DivergenceError
+from fusion_gym.errors import ConfigurationError, DivergenceError, refusal
 
 LARGEST_ERROR = 1e32  # mean square; rewards become float32
 # Relative errors above the first value give a warning, above the second an error.
@@ -58,10 +58,8 @@ def admit(system: System[Any], horizon: int) -> Array:
     )
     if not longest:
         raise ConfigurationError(f"these numbers together are not allowed: {why}")
-    raise ConfigurationError(
-        f"horizon = {horizon} is not allowed with this plant and these sensors: it must be at "
-        f"most {longest}, because {why}"
-    )
+    allowed = f"at most {longest}, because {why}"
+    raise refusal("horizon", horizon, allowed, "with this plant and these sensors")
 
 
 def _accuracy(system: System[Any], horizon: int) -> float:

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace, ndtr
-from fusion_gym.validation import ConfigurationError
 
 STATES = ("bad", "good")  # of a Gilbert-Elliott channel, in the order of its matrices
 InitialState = Literal["stationary", "bad", "good"]
@@ -70,18 +70,14 @@ class Channel:
         """
         matrix = validation.array("channel_transition", transition, (2, 2))
         if np.any(matrix < 0.0) or not np.allclose(matrix.sum(1), 1.0, rtol=0.0, atol=1e-9):
-            raise ConfigurationError(
-                f"channel_transition = {validation.display(matrix)} is not allowed: it must have "
-                "rows of probabilities that sum to 1"
-            )
+            reason = "it must have rows of probabilities that sum to 1"
+            raise forbidden("channel_transition", matrix, reason)
         drop = _probabilities("drop_probability", drop_probability, (2,))
         if initial == "stationary":
             leaves = matrix[[0, 1], [1, 0]]
             if leaves.sum() == 0.0:
-                raise ConfigurationError(
-                    "initial_channel = 'stationary' is not allowed with a channel that never "
-                    "changes: it must be 'bad' or 'good'"
-                )
+                where = "with a channel that never changes"
+                raise validation.refusal("initial_channel", "stationary", "'bad' or 'good'", where)
             start = leaves[::-1] / leaves.sum()
         else:
             start = np.eye(2)[STATES.index(initial)]

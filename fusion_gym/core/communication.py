@@ -6,7 +6,6 @@ from typing import Any, NamedTuple, get_args
 from fusion_gym import validation
 from fusion_gym.core.options import Feature, Scenario
 from fusion_gym.core.system import System
-from fusion_gym.validation import ConfigurationError
 
 FEATURES: tuple[str, ...] = get_args(Feature)
 
@@ -32,21 +31,17 @@ def communication(scenario: Scenario) -> Communication:
     if memory_system is None and not scenario.nodes_have_memory:
         memory_system = scenario.system
     if has_memory and options.information == "centre":
-        raise ConfigurationError(
-            "memory = True is not allowed with information='centre': it must be False, because "
-            "the centre stores only deliveries"
-        )
+        allowed = "False, because the centre stores only deliveries"
+        raise validation.refusal("memory", True, allowed, "with information='centre'")
     if options.memory_filter is not None and not has_memory:
         raise validation.refusal("memory_filter", options.memory_filter, "None unless memory=True")
     features = _features(options.belief_features, has_memory)
     if features and options.information == "centre":
-        raise validation.refusal(
-            "belief_features", options.belief_features, "None or empty with information='centre'"
-        )
+        allowed = "None or empty with information='centre'"
+        raise validation.refusal("belief_features", options.belief_features, allowed)
     if options.memory_filter is not None and scenario.memory_system is None:
-        raise validation.refusal(
-            "memory_filter", options.memory_filter, "None here, because this system has one filter"
-        )
+        allowed = "None here, because this system has one filter"
+        raise validation.refusal("memory_filter", options.memory_filter, allowed)
     if options.packet == "estimate":
         _check_estimates(scenario, has_memory)
     return Communication(_broadcast(scenario), memory_system if has_memory else None, features)
@@ -67,10 +62,8 @@ def _broadcast(scenario: Scenario) -> str:
     if value is None:
         return "estimate" if scenario.feedback else "none"
     if value == "none" and scenario.feedback:
-        raise ConfigurationError(
-            "broadcast = 'none' is not allowed here: it must be 'estimate' or 'packets', because "
-            "the nodes receive the centre's estimate"
-        )
+        allowed = "'estimate' or 'packets', because the nodes receive the centre's estimate"
+        raise validation.refusal("broadcast", "none", allowed, "here")
     return value
 
 

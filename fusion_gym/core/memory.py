@@ -54,11 +54,8 @@ class Memory:
         self.task, self.owner = task, owner
         own = owner == "own"
         if own and task.packet == "estimate":
-            raise refusal(
-                "packet",
-                task.packet,
-                "'measurement' with local sensors, because the estimate belongs to the scheduler",
-            )
+            why = "with local sensors, because the estimate belongs to the scheduler"
+            raise refusal("packet", task.packet, f"'measurement' {why}")
         distant = task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
         self._needs_single = own and distant
         self._needs_own = own and task.memory_system is not None

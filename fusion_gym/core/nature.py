@@ -60,9 +60,8 @@ class Nature:
         for name in nature.departing:
             if name in absent:
                 model = _MODEL[list(DEPARTURES).index(name)]
-                raise refusal(
-                    name, getattr(selection, name), f"{model:g} here, because {DEPARTURES[name]}"
-                )
+                allowed = f"{model:g} here, because {DEPARTURES[name]}"
+                raise refusal(name, getattr(selection, name), allowed)
         return nature
 
     @property

@@ -19,7 +19,7 @@ from fusion_gym.importing import name_of
 
 AccessRule = Literal["any", "single", "round_robin", "random"]
 Tokens = Literal["limited", "unlimited"]
-SharingRule = Literal["equal", "fixed", "rotating", "turns"]
+SharingRule = Literal["equal", "fixed", "turns"]
 ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
@@ -76,9 +76,8 @@ class CommonOptions:
     sharing: SharingRule = "turns"
     """Rule by which simultaneous requests share the tokens. ``"equal"`` grants if ξ/l ≥ c for l
     sensors (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
-    sensors while tokens last. ``"rotating"`` starts that order one sensor later in each step.
-    ``"turns"`` grants in the order of a queue: a granted sensor goes to its end, and a head that
-    the tokens do not pay for blocks the sensors behind it."""
+    sensors while tokens last. ``"turns"`` grants in the order of a queue: a granted sensor goes to
+    its end, and a head that the tokens do not pay for blocks the sensors behind it."""
     packet: Literal["measurement", "estimate"] = "measurement"
     """Content of a packet. ``"measurement"`` is the sensor's measurement or its node's estimate.
     ``"estimate"`` is the centralised scheduler's estimate with its covariance and needs

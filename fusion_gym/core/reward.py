@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import ErrorKind
+from fusion_gym.errors import forbidden
 from fusion_gym.importing import import_named, name_of
 from fusion_gym.namespace import namespace
 from fusion_gym.validation import ConfigurationError
@@ -223,16 +224,12 @@ class Price:
         if isinstance(cost_weight, str):
             validation.choice("cost_weight", cost_weight, ("random",))
             if span is None:
-                raise ConfigurationError(
-                    "price_range = None is not allowed with cost_weight='random': it must be a "
-                    "pair (low, high) with 0 < low < high"
-                )
+                allowed = "a pair (low, high) with 0 < low < high"
+                raise validation.refusal("price_range", None, allowed, "with cost_weight='random'")
             return cls(None, span)
         price = validation.number("cost_weight", cost_weight, at_least=0.0)
         if span is not None and not span[0] <= price <= span[1]:
-            raise ConfigurationError(
-                f"cost_weight = {price} is not allowed: it must lie in price_range = {list(span)}"
-            )
+            raise forbidden("cost_weight", price, f"it must lie in price_range = {list(span)}")
         return cls(price, span)
 
     def draw(self, uniform: Array) -> Array:

@@ -174,12 +174,12 @@ class Runs:
         self, requests: NDArray[np.bool_], runs: NDArray[np.int64] | slice = slice(None)
     ) -> Grants:
         """Return the grants for requests (sensors, R) of the R ``runs``."""
-        steps, queue = self.steps[runs], self.queue[:, runs]
+        queue = self.queue[:, runs]
         if self._gaps or self.task.access in ("round_robin", "random"):
             requests = requests & self.admitted()[:, runs]
         if self.task.access == "single":
             requests = first_request(requests, queue)
-        return self.task.bucket.grant(self.tokens[runs], requests, steps, queue)
+        return self.task.bucket.grant(self.tokens[runs], requests, queue)
 
     def sense(self, noise: Array) -> None:
         """Make the second half of a step: move the plant and measure, with noise (channels, N)."""

@@ -18,7 +18,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.options import CommonOptions, Scenario, plain_options
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import TokenBucket
-from fusion_gym.errors import ConfigurationError, display
+from fusion_gym.errors import ConfigurationError, display, forbidden
 
 Build = Callable[[Any], Scenario]
 _RUNS, _STEPS, _SEED = 32, 200, 20_261_124
@@ -109,11 +109,11 @@ def price_range(task: Task) -> tuple[float, float]:
 
 def prices_at(spent: Array, error: Array, tokens: Array) -> Array:
     """Return the slopes of the lower envelope where the best policy spends ``tokens``."""
-    spent, error = _envelope(spent, error)
-    if len(spent) < 3:
-        raise ConfigurationError(
-            "price_range = 'auto' is not allowed here: transmissions do not lower the error"
-        )
+    vertices = lower_hull(spent, error)
+    spent, error = spent[vertices], error[vertices]
+    if len(vertices) < 3:
+        reason = "transmissions do not lower the error"
+        raise forbidden("price_range", "auto", reason, "here")
     middle = np.sqrt(spent[1:] * np.maximum(spent[:-1], 0.25 * spent[1]))
     slopes = np.log(np.diff(-error) / np.diff(spent))
     return np.exp(np.interp(np.log(tokens), np.log(middle), slopes))
@@ -145,21 +145,22 @@ def _sweep(task: Task) -> tuple[Array, Array]:
     return spent, error
 
 
-def _envelope(spent: Array, error: Array) -> tuple[Array, Array]:
-    """Return the vertices of the lower convex envelope, in the order of rising tokens."""
-    vertices: list[int] = []
-    for point in np.lexsort((error, spent)).tolist():
-        while len(vertices) > 1 and _above(vertices[-2], vertices[-1], point, spent, error):
-            vertices.pop()
-        vertices.append(point)
-    vertices = vertices[: 1 + int(np.argmin(error[vertices]))]
-    return spent[vertices], error[vertices]
+def lower_hull(rate: Array, error: Array) -> list[int]:
+    """Return the vertices of the lower convex hull, by rising rate and strictly falling error."""
+    hull: list[int] = []
+    for point in np.lexsort((error, rate)).tolist():
+        if hull and error[point] >= error[hull[-1]]:
+            continue
+        while len(hull) > 1 and _above(hull[-2], hull[-1], point, rate, error):
+            hull.pop()
+        hull.append(point)
+    return hull
 
 
-def _above(left: int, middle: int, right: int, spent: Array, error: Array) -> bool:
-    """Return whether the middle point lies on or above the chord of the others."""
-    rise = (error[middle] - error[left]) * (spent[right] - spent[left])
-    return bool(rise >= (error[right] - error[left]) * (spent[middle] - spent[left]))
+def _above(left: int, middle: int, right: int, rate: Array, error: Array) -> bool:
+    """Return whether the middle point lies on or above the line between the others."""
+    rise = (error[middle] - error[left]) * (rate[right] - rate[left])
+    return bool(rise >= (error[right] - error[left]) * (rate[middle] - rate[left]))
 
 
 def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:

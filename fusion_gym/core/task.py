@@ -136,9 +136,8 @@ class Task:
         """
         options, system = scenario.options, scenario.system
         if not isinstance(system, System):
-            raise validation.refusal(
-                "system", system, "an instance of fusion_gym.core.system.System"
-            )
+            allowed = "an instance of fusion_gym.core.system.System"
+            raise validation.refusal("system", system, allowed)
         if system.nature != (nature := Nature.create(options)):
             nature.refuse("here", f"the truth of {type(system).__name__} is its model")
         horizon = validation.horizon(options.horizon)

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import SharingRule
-from fusion_gym.namespace import namespace, permute, ranked_sum, take_rows
+from fusion_gym.errors import forbidden
+from fusion_gym.namespace import namespace, ranked_sum
 from fusion_gym.validation import ConfigurationError
 
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
@@ -53,10 +54,9 @@ class TokenBucket:
         sharing: ``"equal"``: each of the l sensors owns ξ/l of the tokens ξ before this step's
             spending, and a request is granted if ξ/l >= c_m (tobit_token_bucket, equations (16) and
             (18)). ``"fixed"``: requests are granted in the order of the sensors while tokens last.
-            ``"rotating"``: the same order starts one sensor later in each step. ``"turns"``: the
-            order is a queue, whose head blocks the others if the tokens do not pay for it; of two
-            sensors with equal requests, neither gets more than one grant more than the other in any
-            window.
+            ``"turns"``: the order is a queue, whose head blocks the others if the tokens do not pay
+            for it; of two sensors with equal requests, neither gets more than one grant more than
+            the other in any window.
         unlimited: Whether every request is granted; tokens spent are counted, the level stays full.
     """
 
@@ -96,10 +96,8 @@ class TokenBucket:
             )
         start = validation.number("initial_tokens", initial, at_least=0.0)
         if start > limit:
-            raise ConfigurationError(
-                f"initial_tokens = {start} is not allowed: with token_capacity = {limit:g} it must "
-                f"be >= 0 and <= {limit:g}"
-            )
+            reason = f"with token_capacity = {limit:g} it must be >= 0 and <= {limit:g}"
+            raise forbidden("initial_tokens", start, reason)
         return cls(
             rate=validation.number("token_rate", rate, at_least=0.0),
             capacity=limit,
@@ -142,18 +140,13 @@ class TokenBucket:
         return (self.cost * share <= tokens + _ROUNDING) | self.unlimited
 
     def grant(
-        self,
-        tokens: Array,
-        requests: NDArray[np.bool_],
-        step: NDArray[np.int64],
-        queue: Queue | None = None,
+        self, tokens: Array, requests: NDArray[np.bool_], queue: Queue | None = None
     ) -> Grants:
         """Return the grants for the requests of a step.
 
         Args:
             tokens: (N,).
             requests: (sensors, N) bool.
-            step: Steps taken (N,), the start of the order of ``"rotating"``.
             queue: (sensors, N), the order of ``"turns"``; by default sensor 0 is first.
 
         Source: tobit_token_bucket, equations (16)-(18).
@@ -165,32 +158,23 @@ class TokenBucket:
         elif self.sharing == "equal":
             granted = requests & self.affordable(tokens)
         elif self.sharing == "turns":
-            granted = self._grant_by_queue(tokens, requests, queue)
+            due = ranked_sum(requests * self.cost, queue)  # for all requests up to each one's place
+            granted = requests & (due <= tokens + _ROUNDING)
         else:
-            granted = self._grant_in_order(tokens, requests, step)
+            granted = self._grant_in_order(tokens, requests)
         spent = linalg.total(granted * self.cost)
         if not self.unlimited:
             tokens = xp.minimum(xp.maximum(tokens + self.rate - spent, 0.0), self.capacity)
         return Grants(granted, spent, tokens, move_to_end(queue, granted))
 
-    def _grant_by_queue(
-        self, tokens: Array, requests: NDArray[np.bool_], queue: Queue
-    ) -> NDArray[np.bool_]:
-        """Grant each request if the tokens pay for it and all requests ahead in the queue."""
-        return requests & (ranked_sum(requests * self.cost, queue) <= tokens + _ROUNDING)
-
-    def _grant_in_order(
-        self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
-        """Grant affordable requests in the order of the sensors, from the first of this step."""
-        xp, count, left = namespace(tokens, requests), len(requests), tokens + _ROUNDING
-        first = step if self.sharing == "rotating" else 0 * step
-        order = (np.arange(count)[:, None] + first) % count
-        cost, answers = xp.asarray(self.cost)[order, 0], []
-        for request, price in zip(take_rows(requests, order), cost, strict=True):
+    def _grant_in_order(self, tokens: Array, requests: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Grant affordable requests in the order of the sensors."""
+        left, answers = tokens + _ROUNDING, []
+        for request, price in zip(requests, self.cost, strict=True):
             answers.append(request & (price <= left))
             left = left - answers[-1] * price
-        return permute(xp.stack(answers), order)
+        granted: NDArray[np.bool_] = namespace(tokens, requests).stack(answers)
+        return granted
 
 
 def move_to_end(queue: Queue, granted: NDArray[np.bool_]) -> Queue:

@@ -68,9 +68,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         if error != "squared" and reference is None:
             raise refusal("error", error, "'squared' without a reference")
         if error != "squared" and task.reward.error != "squared":
-            raise refusal(
-                "error", error, f"'squared' with the task's error={task.reward.error_kind!r}"
-            )
+            allowed = f"'squared' with the task's error={task.reward.error_kind!r}"
+            raise refusal("error", error, allowed)
         super().__init__(task, num_envs, **options)
         if error != "squared":
             self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)

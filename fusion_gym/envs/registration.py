@@ -20,6 +20,7 @@ from fusion_gym.core.scale import resolve
 from fusion_gym.core.task import Task
 from fusion_gym.envs.option_file import read_options
 from fusion_gym.envs.option_text import Option, list_options, options_in
+from fusion_gym.errors import forbidden
 from fusion_gym.importing import imported, name_of
 from fusion_gym.validation import ConfigurationError
 
@@ -109,9 +110,7 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
             raise validation.refusal("build", None, "a function or its name", f"for {env_id!r}")
         parse_env_id(str(env_id))
         if ENVIRONMENTS.get(env_id, build) != build:
-            raise ConfigurationError(
-                f"env_id = {env_id!r} is not allowed: it is registered already"
-            )
+            raise forbidden("env_id", env_id, "it is registered already")
         ENVIRONMENTS[env_id] = build
     for name in ENVIRONMENTS:
         if name not in gymnasium.registry:

@@ -17,7 +17,7 @@ from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import ObservationEntry, ObservationLayout
 from fusion_gym.core.system import Knowledge
 from fusion_gym.core.task import Task
-from fusion_gym.errors import ConfigurationError, display
+from fusion_gym.errors import ConfigurationError, display, refusal
 
 Rows = NDArray[np.float32]
 Requests = NDArray[np.bool_]
@@ -115,15 +115,11 @@ class SensorView:
         self.knowledge: Knowledge = "own_memory" if task.memory else "own"
         self.owner: Owner | None = "own" if task.memory or task.belief_features else None
         if task.packet == "estimate":
-            raise ConfigurationError(
-                "packet = 'estimate' is not allowed with a local view: it must be 'measurement', "
-                "because the estimate belongs to the scheduler"
-            )
+            allowed = "'measurement', because the estimate belongs to the scheduler"
+            raise refusal("packet", "estimate", allowed, "with a local view")
         if task.information != "sensors":
-            raise ConfigurationError(
-                f"information = {task.information!r} is not allowed with a local view: it must be "
-                "'sensors', because a sensor uses its own measurement"
-            )
+            allowed = "'sensors', because a sensor uses its own measurement"
+            raise refusal("information", task.information, allowed, "with a local view")
         layout, count = ObservationLayout(task, "own"), task.sensors
         received = [
             p for p, entry in enumerate(layout.entries) if is_received(entry, task.broadcast)

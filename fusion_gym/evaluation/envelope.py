@@ -1,11 +1,11 @@
 """The lower envelope of many policies in the plane of transmission rate and error."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from fusion_gym.arrays import Array
+from fusion_gym.core.scale import lower_hull
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.validation import ConfigurationError
@@ -32,15 +32,6 @@ class EnvelopePoint(NamedTuple):
     mse: float
 
 
-def points_of(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
-    """Return the mean rate and error of each policy, sorted by rate, then by error."""
-    points = [
-        EnvelopePoint(name, float(r.rate.mean()), float(r.mse.mean()))
-        for name, r in results.items()
-    ]
-    return sorted(points, key=lambda point: (point.rate, point.mse, point.name))
-
-
 def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
     """Return the lower convex hull of the policies' points (rate, MSE).
 
@@ -65,28 +56,15 @@ def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]
         >>> [(point.name, round(point.rate, 2)) for point in lower_envelope(results)]
         [('never', 0.0), ('periodic:period=4', 0.25), ('always', 0.55)]
     """
-    return lower_hull(points_of(results))
-
-
-def lower_hull(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
-    """Return the lower convex hull of points in any order."""
-    ordered = sorted(points, key=lambda point: (point.rate, point.mse, point.name))
-    if not ordered:
+    if not results:
         raise ConfigurationError("policies = {} is not allowed: an envelope needs at least one")
-    hull: list[EnvelopePoint] = []
-    for point in ordered:
-        if hull and point.mse >= hull[-1].mse:
-            continue
-        while len(hull) >= 2 and _above(hull[-2], hull[-1], point):
-            hull.pop()
-        hull.append(point)
-    return hull
-
-
-def _above(left: EnvelopePoint, middle: EnvelopePoint, right: EnvelopePoint) -> bool:
-    """Return whether ``middle`` lies on or above the line from ``left`` to ``right``."""
-    rise = (middle.mse - left.mse) * (right.rate - left.rate)
-    return rise >= (right.mse - left.mse) * (middle.rate - left.rate)
+    points = [
+        EnvelopePoint(name, float(result.rate.mean()), float(result.mse.mean()))
+        for name, result in sorted(results.items())
+    ]
+    rates = np.array([point.rate for point in points])
+    errors = np.array([point.mse for point in points])
+    return [points[place] for place in lower_hull(rates, errors)]
 
 
 def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | None:
@@ -99,10 +77,6 @@ def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | No
         return {left.name: 1.0}
     share = (rate - left.rate) / (right.rate - left.rate)
     return {left.name: 1.0 - share, right.name: share}
-
-
-def _mixed(results: Mapping[str, EpisodeResults], shares: Mapping[str, float]) -> Array:
-    return np.asarray(sum(share * results[name].mse for name, share in shares.items()))
 
 
 class BaselineComparison(NamedTuple):
@@ -159,7 +133,7 @@ def compare_with_envelope(
             f"rate = {rate:.4f} is below every baseline's (the smallest is {hull[0].rate:.4f}): "
             "add 'never' to the baselines"
         )
-    envelope = _mixed(baselines, shares)
+    envelope = np.asarray(sum(share * baselines[name].mse for name, share in shares.items()))
     between = tuple(name for name, share in shares.items() if share > 0.0)
     rates = [float(baselines[name].rate.mean()) for name in between]
     return BaselineComparison(

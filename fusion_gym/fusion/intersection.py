@@ -442,9 +442,8 @@ class SequentialIntersection(SmallestTrace):
         )
         if not whole or not value or sorted(value) != list(range(count or len(value))):
             last = "l - 1" if count is None else f"{count - 1}"
-            raise refusal(
-                "order", value, f"a tuple that holds each of the estimates 0 to {last} exactly once"
-            )
+            allowed = f"a tuple that holds each of the estimates 0 to {last} exactly once"
+            raise refusal("order", value, allowed)
 
 
 class _Step(NamedTuple):

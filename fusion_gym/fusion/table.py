@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.errors import forbidden
 from fusion_gym.fusion.intersection import (
     SequentialIntersection,
     covariance_intersection,
@@ -147,10 +148,8 @@ def choose_rule(
     """
     known = structure.offered
     if isinstance(name, str) and name in RULES and name not in known:
-        raise ConfigurationError(
-            f"fusion = {name!r} is not allowed: it must be one of {', '.join(map(repr, known))}, "
-            f"because {structure.refusal(RULES[name])}"
-        )
+        allowed = f"one of {', '.join(map(repr, known))}, because {structure.refusal(RULES[name])}"
+        raise validation.refusal("fusion", name, allowed)
     rule = RULES[validation.choice("fusion", name, known)]
     if rule.pair and sensors + structure.prediction != 2:
         prediction = " (the centre's prediction is one of them)" if structure.prediction else ""
@@ -169,10 +168,8 @@ def choose_rule(
     if order is None:
         return rule.make().with_weights(state_weights)
     if not rule.ordered:
-        raise ConfigurationError(
-            f"order = {validation.display(order)} is not allowed with fusion={name!r}: it belongs "
-            "to the sequential rules 'sici' and 'sci'"
-        )
+        reason = "it belongs to the sequential rules 'sici' and 'sci'"
+        raise forbidden("order", order, reason, f"with fusion={name!r}")
     arrival = _arrival(order, sensors)
     if structure.prediction:
         arrival = (0, *(i + 1 for i in arrival))
@@ -182,8 +179,5 @@ def choose_rule(
 def _arrival(order: ArrayLike, sensors: int) -> tuple[int, ...]:
     values = validation.array("order", order, (sensors,))
     if sorted(values.tolist()) != list(range(sensors)):
-        raise ConfigurationError(
-            f"order = {validation.display(order)} is not allowed: it must hold each of the "
-            f"sensors 0 to {sensors - 1} once"
-        )
+        raise forbidden("order", order, f"it must hold each of the sensors 0 to {sensors - 1} once")
     return tuple(int(sensor) for sensor in values)

@@ -69,10 +69,8 @@ def write_report(report: FieldReport, folder: Path) -> str:
     best, windows = report.best, len(report.points[PRACTICE][0].errors)
     seconds, settings = report.recording.interval.total_seconds(), _settings(report)
     devices = yaml.safe_dump(settings, sort_keys=False)
-    filter_name, thresholds = (
-        METHODS[best.name][0],
-        [s["reportable_change"] for s in settings.values()],
-    )
+    filter_name = METHODS[best.name][0]
+    thresholds = [row["reportable_change"] for row in settings.values()]
     trigger = f' trigger="report_on_change", trigger_threshold={thresholds},'
     trigger = trigger if filter_name == "truncated" else ""
     summary = [
@@ -173,10 +171,8 @@ def draw_curves(study: FieldStudy, points: Mapping[str, Sequence[MethodPoint]], 
 
 def _settings(report: FieldReport) -> dict[str, dict[str, float]]:
     """Return the settings of each sensor, in the unit of its readings and in seconds."""
-    point, seconds = (
-        _middle(report.points[report.best.name]),
-        report.recording.interval.total_seconds(),
-    )
+    point = _middle(report.points[report.best.name])
+    seconds = report.recording.interval.total_seconds()
     return {
         channel.name: {
             "reportable_change": float(f"{point.thresholds[place]:.4g}"),

@@ -162,9 +162,8 @@ class _Screen:
             self.progress.add_task("", bar=bar)
             yield
             return
-        watched = (
-            sys.stdout is not None and sys.stdout.isatty()
-        )  # otherwise stdout is left unchanged
+        # Otherwise stdout is left unchanged.
+        watched = sys.stdout is not None and sys.stdout.isatty()
         with Progress(*_columns(), console=Console(stderr=True), redirect_stdout=watched) as result:
             self.progress = result
             try:

@@ -195,7 +195,7 @@ class LocalRule(Rule):
         return requests
 
 
-def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:
+def parameter(default: Any, check: Callable[..., Any], **limits: Any) -> Any:
     """Return the field of a parameter with its default and ``check(name, value, **limits)``."""
     check = functools.partial(check, **limits)
     return dataclasses.field(default=default, metadata={"check": check})
@@ -216,6 +216,12 @@ def check_at_most(name: str, value: int | None) -> None:
     """Check the largest number of requests in a step: a whole number >= 1, or None for no limit."""
     if value is not None:
         validation.integer(name, value, at_least=1, at_most=validation.MOST_SENSORS)
+
+
+def check_price(name: str, value: float | None) -> None:
+    """Check a price or a threshold in its place: a number >= 0, or None."""
+    if value is not None:
+        validation.number(name, value, at_least=0.0)
 
 
 def shape_of(signals: Signals) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import SensorView
 from fusion_gym.policies.base import Rule, parameter
-from fusion_gym.validation import ConfigurationError, boolean, refusal
+from fusion_gym.validation import boolean, refusal
 
 
 @dataclass
@@ -49,10 +49,8 @@ def knows(task: Task, own: bool) -> Knowledge:
 def check_owner(task: Task, own: bool, **only_together: Any) -> None:
     """Check that a task shows the measurements, and with ``own`` allows local decisions."""
     if task.information != "sensors":
-        raise ConfigurationError(
-            f"information = {task.information!r} is not allowed with this rule: it must be "
-            "'sensors', because it reads new measurements"
-        )
+        allowed = "'sensors', because it reads new measurements"
+        raise refusal("information", task.information, allowed, "with this rule")
     if not own:
         return
     SensorView(task)  # refuses tasks without local decisions

@@ -8,10 +8,10 @@ import numpy as np
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.belief_rule import knows
+from fusion_gym.policies.belief_rule import check_owner, knows
 from fusion_gym.policies.planning import PlanningModel, transmission_sets
 from fusion_gym.validation import ConfigurationError
 
@@ -71,12 +71,8 @@ class Lookahead:
     def __init__(self, task: Task, price: float = 0.01, steps: int = 4) -> None:
         self.steps = validation.integer("steps", steps, at_least=1, at_most=validation.MOST_STEPS)
         self.price = validation.number("price", price, at_least=0.0)
-        if task.information != "sensors":
-            raise ConfigurationError(
-                f"information = {task.information!r} is not allowed with policy 'lookahead': it "
-                "must be 'sensors', because it reads new measurements"
-            )
-        self._task = task
+        check_owner(task, own=False)
+        self._task, self.knowledge = task, knows(task, own=False)
         self.greedy = task.sensors > _MOST_TOGETHER and task.access != "single"
         if self.greedy and task.sensors > _MOST_GREEDY:
             raise ConfigurationError(
@@ -100,11 +96,6 @@ class Lookahead:
             order[np.searchsorted(number, number[sent] - (1 << sensor), sorter=order)]
             for sensor, sent in enumerate(self._sent)
         ]
-
-    @property
-    def knowledge(self) -> Knowledge:
-        """The class of a scheduler, with memory if the task has memory."""
-        return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Do nothing; the policy has no memory."""

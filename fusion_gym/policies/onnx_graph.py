@@ -14,7 +14,7 @@ from stable_baselines3.dqn.policies import DQNPolicy
 
 from fusion_gym.policies.card import POLICIES
 from fusion_gym.policies.model import ModelPolicy
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 OPSET = 17  # of ONNX 1.12, 2022: sufficient for these networks, and known to older runtimes
 Shapes = dict[str, tuple[str | int, ...]]  # by name; "batch" is the number of rows
@@ -48,10 +48,8 @@ class DecisionGraph(torch.nn.Module):
         super().__init__()
         policy: Any = agent.model.policy
         if not agent.deterministic:
-            raise ConfigurationError(
-                "deterministic = False is not allowed here: it must be True; the graph also "
-                "returns the probability of every request"
-            )
+            allowed = "True; the graph also returns the probability of every request"
+            raise refusal("deterministic", False, allowed, "here")
         if not isinstance(policy, tuple(POLICIES.values())):
             raise ConfigurationError(
                 f"policy {type(policy).__name__} is not allowed here: it must be a policy of "

@@ -102,10 +102,9 @@ class PeriodicOptimum:
         validation.integer("packets", packets, at_least=1, at_most=period * task.sensors)
         validation.choice("average", average, AVERAGES)
         if task.access != "any":
-            raise ConfigurationError(
-                f"access = {task.access!r} is not allowed with policy 'periodic_optimum': it must "
-                "be 'any', because the search grants every request"
-            )
+            where = "with policy 'periodic_optimum'"
+            allowed = "'any', because the search grants every request"
+            raise validation.refusal("access", task.access, allowed, where)
         _cycle(task.system)
         count = math.comb(period * task.sensors, packets)
         if count > _MOST:

@@ -32,7 +32,7 @@ class PlanningModel:
     """
 
     def __init__(self, task: Task, signals: Signals) -> None:
-        self._task, self._state, self._step = task, signals["model"], signals["step"]
+        self._task, self._state = task, signals["model"]
         self._tokens, self._admitted = signals["tokens"], signals["admitted"]
         self._queue = signals["queue"]
         self._beliefs = beliefs_of(signals, own=False) if task.memory else None
@@ -48,8 +48,7 @@ class PlanningModel:
 
     def grant(self, requests: NDArray[np.bool_]) -> Grants:
         """Return the network's answer to requests (sensors, N) now."""
-        admitted = requests & self._admitted
-        return self._task.bucket.grant(self._tokens, admitted, self._step, self._queue)
+        return self._task.bucket.grant(self._tokens, requests & self._admitted, self._queue)
 
     def fused_means(self, arriving: NDArray[np.bool_], steps: int) -> Array:
         """Return the predicted fused means (steps, n, N) after a delivery of these packets.

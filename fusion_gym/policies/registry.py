@@ -42,46 +42,53 @@ class PolicyRow(NamedTuple):
     attribute ``rest`` names the parameter that takes the rest of the text, which may contain colons
     and commas.
 
-    Without a kind, a function makes an agent, with the text after its name as its first parameter.
-    A class with a parameter ``task`` is a reference, and any other class is a rule.
+    An agent takes the text after its name as its first parameter.
     """
 
     maker: Maker | str
-    kind: Kind | None = None
+    kind: Kind
 
 
-_ROWS: dict[str, PolicyRow] = {
-    name: PolicyRow(f"fusion_gym.policies.{place}")
-    for name, place in {
+_SHIPPED: dict[Kind, dict[str, str]] = {
+    "rule": {
         "adaptive_innovation": "rules.adaptive_innovation:AdaptiveInnovation",
         "adaptive_threshold": "rules.adaptive_threshold:AdaptiveThreshold",
         "always": "rules.constant:Always",
         "centre_variance": "rules.centre_variance:CentreVariance",
         "dynamic_event": "rules.dynamic_event:DynamicEvent",
-        "estimate_difference": "rules.estimate_difference:EstimateDifference",
         "information_gain": "rules.information_gain:InformationGain",
         "innovation_threshold": "rules.innovation_threshold:InnovationThreshold",
-        "kullback_leibler": "rules.kullback_leibler:KullbackLeibler",
         "local_variance": "rules.local_variance:LocalVariance",
-        "lookahead": "lookahead:Lookahead",
-        "model": "saved:saved_agent",
         "never": "rules.constant:Never",
-        "optimal": "optimal:OptimalPolicy",
         "paced": "rules.paced:Paced",
         "periodic": "rules.periodic:Periodic",
-        "periodic_optimum": "periodic_optimum:PeriodicOptimum",
-        "priced_threshold": "rules.priced_threshold:PricedThreshold",
         "random": "rules.random:Random",
         "report_on_change": "rules.report_on_change:ReportOnChange",
-        "rollout": "rollout:Rollout",
         "round_robin": "rules.periodic:RoundRobin",
         "send_on_delta": "rules.send_on_delta:SendOnDelta",
         "stochastic_event": "rules.stochastic_event:StochasticEvent",
-        "value_of_information": "rules.value_of_information:ValueOfInformation",
         "variance_threshold": "rules.variance_threshold:VarianceThreshold",
+    },
+    "reference": {
+        "estimate_difference": "rules.estimate_difference:EstimateDifference",
+        "kullback_leibler": "rules.kullback_leibler:KullbackLeibler",
+        "lookahead": "lookahead:Lookahead",
+        "optimal": "optimal:OptimalPolicy",
+        "periodic_optimum": "periodic_optimum:PeriodicOptimum",
+        "priced_threshold": "rules.priced_threshold:PricedThreshold",
+        "rollout": "rollout:Rollout",
+        "value_of_information": "rules.value_of_information:ValueOfInformation",
         "whittle": "whittle:WhittleIndex",
+    },
+    "agent": {
+        "model": "saved:saved_agent",
         "zoo": "saved:zoo_agent",
-    }.items()
+    },
+}
+_ROWS = {
+    name: PolicyRow(f"fusion_gym.policies.{place}", kind)
+    for kind, places in _SHIPPED.items()
+    for name, place in places.items()
 }
 
 
@@ -134,7 +141,7 @@ def policy_names(kind: Kind | None = None) -> list[str]:
     """
     if kind is not None:
         choice("kind", kind, get_args(Kind))
-    return sorted(name for name, row in _ROWS.items() if kind in (None, _kind(row)))
+    return sorted(name for name, row in _ROWS.items() if kind in (None, row.kind))
 
 
 def policy_maker(name: str) -> Maker:
@@ -189,7 +196,7 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     if task.required_policy is not None:
         required = _make(task.required_policy, task.policy_defaults, context)
         _check_required(spec, policy, task, required)
-    if _kind(_parse_policy(spec)[1]) != "agent":  # the loader has checked its observation
+    if _parse_policy(spec)[1].kind != "agent":  # the loader has checked its observation
         _try_out(spec, policy, task)
     return policy
 
@@ -199,7 +206,7 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
     maker = _maker(row)
     known = _parameters(name, maker)
     arguments: dict[str, Any] = {}
-    if _kind(row) == "agent":
+    if row.kind == "agent":
         key, (value, *entries) = next(iter(known)), text.split(",")
         arguments[key] = value.removeprefix(f"{key}=")
     else:
@@ -266,7 +273,7 @@ def _parse_policy(spec: str) -> tuple[str, PolicyRow, str]:
             f"policy = {name!r} is not allowed: it must be a class with knowledge, reset and "
             "__call__, such as a subclass of fusion_gym.policies.base.Rule"
         )
-    return name, PolicyRow(result), behind
+    return name, PolicyRow(result, "rule"), behind
 
 
 def _maker(row: PolicyRow) -> Maker:
@@ -276,15 +283,6 @@ def _maker(row: PolicyRow) -> Maker:
         member: Maker = getattr(importlib.import_module(module), attribute)
         return member
     return maker
-
-
-def _kind(row: PolicyRow) -> Kind:
-    maker = _maker(row)
-    if row.kind is not None:
-        return row.kind
-    if not isinstance(maker, type):
-        return "agent"
-    return "reference" if "task" in inspect.signature(maker).parameters else "rule"
 
 
 def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:

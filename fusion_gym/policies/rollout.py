@@ -9,7 +9,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, guard, is_stateless, owner_of
 from fusion_gym.policies.belief_rule import check_owner, knows
@@ -99,27 +99,18 @@ class Rollout:
             raise validation.refusal("base", base, "the text that names a policy")
         self.base: Policy = make_policy(base, task, trust=trust)
         if not is_stateless(self.base):
-            raise validation.refusal(
-                "base",
-                base,
-                "a policy that reads only signals of the present step, because simulated "
-                "episodes call it",
-            )
+            why = "because simulated episodes call it"
+            allowed = f"a policy that reads only signals of the present step, {why}"
+            raise validation.refusal("base", base, allowed)
         if owner_of(self.base) == "own":
-            raise validation.refusal(
-                "base", base, "a scheduler's policy, because simulations begin with its belief"
-            )
+            allowed = "a scheduler's policy, because simulations begin with its belief"
+            raise validation.refusal("base", base, allowed)
         memory = Memory(task, "scheduler")
-        self._task = task
+        self._task, self.knowledge = task, knows(task, own=False)
         self._decision = guard(self.base, task)
         self._weights = task.reward.error_weight * task.reward.state_weights
         self._imagination = Imagination(task, memory, ObservationLayout(task))
         self.reset(0)
-
-    @property
-    def knowledge(self) -> Knowledge:
-        """The class of a scheduler, with memory if the task has memory."""
-        return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Restart the random streams; run i simulates with the stream of ``seed + i``."""

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.errors import forbidden
 from fusion_gym.solvers.iteration import iterate_values
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
@@ -56,10 +57,9 @@ def solve_ages(
     count = len(problems)
     limit = count if at_most is None else validation.integer("at_most", at_most, at_least=1)
     if any(len(problem.drop) > 1 for problem in problems):
-        raise ConfigurationError(
-            "channel = 'gilbert_elliott' is not allowed for the best schedule by ages: the "
-            "channel must lose packets independently"
-        )
+        where = "for the best schedule by ages"
+        reason = "the channel must lose packets independently"
+        raise forbidden("channel", "gilbert_elliott", reason, where)
     size = longest or max(_default_length(problem, count / limit) for problem in problems)
     if max(size, 2) ** count > _MOST_STATES:
         raise ConfigurationError(

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from fusion_gym import validation
+from fusion_gym.errors import forbidden
 from fusion_gym.solvers.single import solve_average, solve_finite
 from fusion_gym.solvers.source import SourceProblem
-from fusion_gym.validation import ConfigurationError
 
 _TOLERANCE = 1e-3  # relative, of the multiplier; the bound is flat at its maximum
 _DOUBLINGS = 60
@@ -54,10 +54,8 @@ def lagrangian_bound(
         ConfigurationError: a value that is not allowed.
     """
     if any(len(problem.tokens.level) > 1 for problem in problems):
-        raise ConfigurationError(
-            "tokens = 'limited' is not allowed in the parts of the bound: only its price must "
-            "limit each source"
-        )
+        reason = "only its price must limit each source"
+        raise forbidden("tokens", "limited", reason, "in the parts of the bound")
     costs = validation.positive("spent", list(spent), (len(problems),)).tolist()
     gained = validation.number("rate", rate, at_least=0.0)
     start = list(initial_deviation or [0.0] * len(problems))

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.errors import forbidden
 from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
 from fusion_gym.solvers.iteration import iterate_values
 from fusion_gym.solvers.source import Resolution, SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
-from fusion_gym.validation import ConfigurationError
 
 _RESOLUTION = Resolution(finest=20.0, coarsest=4.0, points=160, negligible=1e-5)
 _RESOLUTION_TOKENS = _RESOLUTION._replace(points=110)  # where tokens are limited
@@ -42,15 +42,12 @@ class JointProblem:
     ) -> JointProblem:
         """Return the checked problem; without a bucket the tokens are unlimited."""
         if len(sources) != 2:
-            raise ConfigurationError(
-                f"sensors = {len(sources)} is not allowed for the joint optimum: it must be 2"
-            )
+            raise validation.refusal("sensors", len(sources), "2", "for the joint optimum")
         first, second = sources
         if len(first.drop) > 1 or len(second.drop) > 1:
-            raise ConfigurationError(
-                "channel = 'gilbert_elliott' is not allowed for the joint optimum: the channel "
-                "must lose packets independently"
-            )
+            where = "for the joint optimum"
+            reason = "the channel must lose packets independently"
+            raise forbidden("channel", "gilbert_elliott", reason, where)
         if bucket is None:
             bucket = TokenBucket.create(1.0, 2.0, 2.0, 1.0, sensors=2, unlimited=True)
         limit = validation.integer("at_most", at_most, at_least=1, at_most=2)

@@ -13,7 +13,6 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.solvers.grid import ErrorGrid, default_reach
 from fusion_gym.solvers.tokens import TokenLevels
-from fusion_gym.validation import ConfigurationError
 
 
 class Resolution(NamedTuple):
@@ -144,10 +143,8 @@ class SourceProblem:
                 resolution.negligible,
             )
         if step is None:
-            finest, coarsest = (
-                self.deviation / resolution.finest,
-                self.deviation / resolution.coarsest,
-            )
+            finest = self.deviation / resolution.finest
+            coarsest = self.deviation / resolution.coarsest
             step = min(max(reach / resolution.points, finest), coarsest)
         return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
 
@@ -165,8 +162,7 @@ def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
     balance = np.vstack((transition.T - np.eye(states), np.ones(states)))
     law, _, rank, _ = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0))
     if rank < states:
-        raise ConfigurationError(
-            f"initial = None is not allowed with transition = {transition.tolist()}, which has no "
-            "unique stationary law: it must be the probabilities of the states at time 0"
-        )
+        where = f"with transition = {transition.tolist()}, which has no unique stationary law"
+        allowed = "the probabilities of the states at time 0"
+        raise validation.refusal("initial", None, allowed, where)
     return np.asarray(law)

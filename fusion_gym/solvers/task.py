@@ -131,14 +131,11 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
 
 def _solve_pair(task: Task, problems: tuple[SourceProblem, ...], criterion: str) -> Optimum:
     if len(problems) != 2:
-        raise ConfigurationError(
-            f"sensors = {len(problems)} is not allowed for the optimum under limited tokens or "
-            "access: it must be 1 or 2"
-        )
+        where = "for the optimum under limited tokens or access"
+        raise validation.refusal("sensors", len(problems), "1 or 2", where)
     if task.access not in ("any", "single"):
-        raise validation.refusal(
-            "access", task.access, "'any' or 'single'", "for the optimum of two sources"
-        )
+        allowed = "'any' or 'single'"
+        raise validation.refusal("access", task.access, allowed, "for the optimum of two sources")
     at_most = 1 if task.access == "single" else 2
     problem = JointProblem.create(problems, task.bucket, at_most)
     if criterion == "average":

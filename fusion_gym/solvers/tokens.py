@@ -58,7 +58,7 @@ class TokenLevels:
             following = {
                 round(float(level), _DIGITS)
                 for source in new
-                for level in bucket.grant(np.full(len(choices), source), sets, choices * 0).tokens
+                for level in bucket.grant(np.full(len(choices), source), sets).tokens
             }
             new = sorted(following - result)
             result |= following
@@ -69,8 +69,7 @@ class TokenLevels:
                     "levels, so rate, cost and capacity need a common divisor"
                 )
         level = np.array(sorted(result))
-        tokens = np.repeat(level, len(choices))
-        grants = bucket.grant(tokens, np.tile(sets, len(level)), np.zeros(len(tokens), int))
+        grants = bucket.grant(np.repeat(level, len(choices)), np.tile(sets, len(level)))
         shape = (len(level), len(choices))
         affordable = (grants.granted == np.tile(sets, len(level))).all(0).reshape(shape)
         after = np.searchsorted(level, np.round(grants.tokens, _DIGITS) - 10.0**-_DIGITS)

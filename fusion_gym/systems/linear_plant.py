@@ -25,6 +25,27 @@ def covariance_factor(matrix: Array) -> Array:
     return np.ascontiguousarray(factor[:, factor.any(0)])
 
 
+class Sensors:
+    """The common part of linear sensors: C (sensors, m, n, 1), a noise for each component."""
+
+    measurement_matrix: Array
+
+    @property
+    def count(self) -> int:
+        """Number of sensors."""
+        return self.measurement_matrix.shape[0]
+
+    @property
+    def size(self) -> int:
+        """Number of measured components m of each sensor."""
+        return self.measurement_matrix.shape[1]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals of one measurement of all sensors."""
+        return self.count * self.size
+
+
 @dataclass(frozen=True)
 class Plant:
     """The common part of linear plants: A, the noise w ~ N(0, W) and the law of x(0).

@@ -67,9 +67,8 @@ class Silence:
         where = "with filter='truncated'"
         for name, value in (("trigger", trigger), ("trigger_threshold", threshold)):
             if value is None:
-                raise refusal(
-                    name, None, "that of the policy whose silence the filter reads", where
-                )
+                allowed = "that of the policy whose silence the filter reads"
+                raise refusal(name, None, allowed, where)
         assert trigger is not None
         if channels > 1 and trigger != "report_on_change":
             raise refusal("trigger", trigger, "'report_on_change'", "for several channels")

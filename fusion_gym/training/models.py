@@ -13,6 +13,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SensorView
+from fusion_gym.errors import forbidden
 from fusion_gym.evaluation.cross_term import cross_terms, usual_policies, worst
 from fusion_gym.output.progress import remark
 from fusion_gym.policies.model import tag_model
@@ -32,10 +33,8 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     name, local = experiment.algorithm.name, experiment.environment.local
     many = not local and task.action != "discrete" and task.access != "single"
     if TABLE[name].discrete_only and many:
-        raise ConfigurationError(
-            f"action = {task.action!r} is not allowed with algorithm {name!r}: set the "
-            "environment's option action: discrete"
-        )
+        reason = "set the environment's option action: discrete"
+        raise forbidden("action", task.action, reason, f"with algorithm {name!r}")
     training, where = experiment.training, experiment.environment
     runs: dict[str, Any] = {
         "num_envs": training.num_envs,
@@ -65,9 +64,7 @@ def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -
     except ConfigurationError as error:
         if error_filter is None:
             raise
-        raise ConfigurationError(
-            f"error_filter = {error_filter!r} is not allowed: {error}"
-        ) from None
+        raise forbidden("error_filter", error_filter, str(error)) from None
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
@@ -80,9 +77,7 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
         )
     except (AssertionError, ValueError) as error:  # checks of Stable-Baselines3
         reason = " ".join(str(error).split())
-        raise ConfigurationError(
-            f"algorithm = {settings.name!r} is not allowed with these settings: {reason}"
-        ) from None
+        raise forbidden("algorithm", settings.name, reason, "with these settings") from None
     rate = getattr(settings, "initial_rate", None)
     if rate is not None:
         _begin_at(model, env, rate)
@@ -108,10 +103,8 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
         return np.array([0.0, odds])
     if env.task.access == "single":
         if sensors * rate >= 1.0:
-            raise ConfigurationError(
-                f"initial_rate = {rate} is not allowed: it must be < 1/{sensors}, because one of "
-                f"{sensors} sensors transmits in a step"
-            )
+            allowed = f"< 1/{sensors}, because one of {sensors} sensors transmits in a step"
+            raise refusal("initial_rate", rate, allowed)
         return np.log([1.0 - sensors * rate, *[rate] * sensors])
     bits = np.arange(2**sensors)[:, None] >> np.arange(sensors) & 1
     return np.asarray(bits.sum(1) * odds)

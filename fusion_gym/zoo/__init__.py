@@ -10,7 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.errors import forbidden
+from fusion_gym.validation import choice
 
 
 def names() -> list[str]:
@@ -42,10 +43,8 @@ def model_path(name: str) -> str:
     text, path = card(name)["sha256"], _folder().joinpath(f"{name}.zip")
     value = hashlib.sha256(path.read_bytes()).hexdigest()
     if value != text:
-        raise ConfigurationError(
-            f"zoo = {name!r} is not allowed: {path} has the SHA-256 {value}, its card says "
-            f"{text}; reinstall fusion-gym"
-        )
+        reason = f"{path} has the SHA-256 {value}, its card says {text}; reinstall fusion-gym"
+        raise forbidden("zoo", name, reason)
     return str(path)
 
 

@@ -40,7 +40,7 @@ def test_a_denied_request_changes_nothing(case: Case) -> None:
 
 @each_case
 def test_grantable_is_what_the_network_grants_alone(case: Case) -> None:
-    for scarce in ({}, SCARCE | {"token_cost": 4.0}, SCARCE | {"sharing": "rotating"}):
+    for scarce in ({}, SCARCE | {"token_cost": 4.0}, SCARCE | {"sharing": "fixed"}):
         batch = case.batch(**scarce)
         for request in requests(batch.task, 3, STEPS, rate=0.8):
             grantable = batch.grantable()

@@ -12,6 +12,7 @@ from fusion_gym.policies.base import (
     PerSensor,
     Requests,
     Rule,
+    check_price,
     each_number,
     not_negative_parameter,
     parameter,
@@ -20,15 +21,6 @@ from fusion_gym.policies.base import (
 from fusion_gym.policies.belief_rule import BeliefRule
 
 Score = Literal["value", "innovation", "variance"]
-
-
-def _score(name: str, value: Score) -> None:
-    validation.choice(name, value, get_args(Score))
-
-
-def _price(name: str, value: float | None) -> None:
-    if value is not None:
-        validation.number(name, value, at_least=0.0)
 
 
 class ThresholdNumbers(NamedTuple):
@@ -96,10 +88,10 @@ class PricedThreshold(BeliefRule):
     memory=True``.
     """
 
-    score: Score = parameter("value", _score)
+    score: Score = parameter("value", validation.choice, options=get_args(Score))
     threshold: PerSensor = parameter(0.03, not_negative_parameter)
     price_exponent: PerSensor = parameter(1.0, each_number)
-    price: float | None = parameter(None, _price)
+    price: float | None = parameter(None, check_price)
     reference_price: float = parameter(1.0, validation.number, above=0.0)
     mixture: float = parameter(0.0, validation.number, at_least=0.0, at_most=1.0)
     token_exponent: float = parameter(0.0, validation.number)

@@ -7,14 +7,9 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
+from fusion_gym.errors import forbidden
+from fusion_gym.policies.base import Requests, check_at_most, check_price, parameter, strongest
 from fusion_gym.policies.belief_rule import BeliefRule
-from fusion_gym.validation import ConfigurationError
-
-
-def _optional(name: str, value: float | None) -> None:
-    if value is not None:
-        validation.number(name, value, at_least=0.0)
 
 
 @dataclass
@@ -61,8 +56,8 @@ class ValueOfInformation(BeliefRule):
     filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
-    threshold: float | None = parameter(None, _optional)
-    price: float | None = parameter(None, _optional)
+    threshold: float | None = parameter(None, check_price)
+    price: float | None = parameter(None, check_price)
     at_most: int | None = parameter(None, check_at_most)
     steps: int = parameter(1, validation.integer, at_least=1, at_most=validation.MOST_STEPS)
     together: ClassVar[tuple[str, ...]] = ("at_most", "steps")
@@ -70,10 +65,8 @@ class ValueOfInformation(BeliefRule):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.threshold is not None and self.price is not None:
-            raise ConfigurationError(
-                f"price = {self.price} is not allowed with threshold = {self.threshold}: leave "
-                "one of them out"
-            )
+            reason = "leave one of them out"
+            raise forbidden("price", self.price, reason, f"with threshold = {self.threshold}")
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.errors import forbidden
 from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
 from fusion_gym.systems.tobit.centre import Centre, NodeCentre, SequentialCentre
@@ -77,10 +78,8 @@ def _system(task: Task) -> CensoredSystem:
             "linear plant from all measurements, as TobitOscillator and the biased systems do"
         )
     if system.model is not system.plant:
-        raise ConfigurationError(
-            "bias_aware = False is not allowed for the bound: the filters must predict with the "
-            "plant's own matrix"
-        )
+        reason = "the filters must predict with the plant's own matrix"
+        raise forbidden("bias_aware", False, reason, "for the bound")
     system.nature.refuse("for the bound")
     if not _predicts(system.centre):
         raise ConfigurationError(

@@ -34,9 +34,8 @@ class SilenceProblem:
         cls, transition: ArrayLike, weights: ArrayLike, noise: ArrayLike, price: float
     ) -> SilenceProblem:
         """Return the checked problem; ``noise`` is one covariance per step."""
-        matrix = validation.array("transition", transition, (None, None))
+        matrix = validation.square("transition", transition)
         size = len(matrix)
-        matrix = validation.array("transition", matrix, (size, size))
         values = np.asarray(noise, dtype=np.float64)
         if values.ndim != 3 or not len(values):
             raise ConfigurationError(

@@ -134,8 +134,7 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
 
 def _plant_and_sensors(options: CorrelatedTrackingOptions) -> tuple[LinearPlant, CorrelatedSensors]:
     """Return plant and sensors at the bounds; both use the same process normals."""
-    size = len(validation.array("transition", options.transition, (None, None)))
-    validation.array("transition", options.transition, (size, size))
+    size = len(validation.square("transition", options.transition))
     gain = validation.array("process_gain", options.process_gain, (size, None))
     variance = validation.positive("process_variance", options.process_variance, gain.shape[1:])
     factor = gain * np.sqrt(variance)

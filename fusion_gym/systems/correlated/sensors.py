@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.linear_plant import LinearPlant, Sensors
 
 
 @dataclass(frozen=True)
-class CorrelatedSensors:
+class CorrelatedSensors(Sensors):
     """y_i = H_i x + η_i + β_i w, where w is the noise that has just moved the plant.
 
     Shapes: ``measurement_matrix`` H (sensors, m, n, 1); ``deviation`` (sensors, m, 1), the bound of
@@ -57,19 +57,14 @@ class CorrelatedSensors:
         Raises:
             ConfigurationError: a wrong shape, a variance <= 0, or an entry that is not finite.
         """
-        matrix = validation.array("measurement_matrices", measurement_matrices, (None, None, None))
-        matrix = validation.array(
-            "measurement_matrices", measurement_matrices, (*matrix.shape[:2], plant.size)
-        )
+        shape = (None, None, plant.size)
+        matrix = validation.array("measurement_matrices", measurement_matrices, shape)
         sensors, size, _ = matrix.shape
-        variance = validation.positive(
-            "measurement_variance", _one_each(measurement_variance, sensors, 1), (sensors, size)
-        )
-        beta = validation.spread(
-            "noise_coupling",
-            _one_each(noise_coupling, sensors, 2),
-            (sensors, size, len(process_deviation)),
-        )
+        given = validation.by_row(measurement_variance, (sensors, size))
+        variance = validation.positive("measurement_variance", given, (sensors, size))
+        shares = (sensors, size, len(process_deviation))
+        given = validation.by_row(noise_coupling, shares)
+        beta = validation.spread("noise_coupling", given, shares)
         coupling = (beta * process_deviation)[..., None]
         shared = linalg.matmul(coupling[:, None], linalg.transpose(coupling)[None])
         own = variance[:, None, :, None] * np.eye(size) * np.eye(sensors)[:, :, None, None]
@@ -80,21 +75,6 @@ class CorrelatedSensors:
             covariance=shared + own[..., None],
             cross_covariance=linalg.matmul(plant.process_factor, linalg.transpose(coupling)),
         )
-
-    @property
-    def count(self) -> int:
-        """Number of sensors."""
-        return self.measurement_matrix.shape[0]
-
-    @property
-    def size(self) -> int:
-        """Number of measured components m of each sensor."""
-        return self.measurement_matrix.shape[1]
-
-    @property
-    def noise_channels(self) -> int:
-        """Standard normals of one measurement of all sensors, without the plant's."""
-        return self.count * self.size
 
     def measure(self, state: Array, process_noise: Array, noise: Array) -> Array:
         """Return the measurements (sensors, m, N).
@@ -111,12 +91,3 @@ class CorrelatedSensors:
         result += self.deviation * noise.reshape(self.count, self.size, noise.shape[-1])
         result += linalg.matvec(self.coupling, process_noise)
         return result
-
-
-def _one_each(value: ArrayLike, sensors: int, missing: int) -> ArrayLike:
-    """Return one number per sensor as a column that broadcasts over its ``missing`` later axes."""
-    try:
-        values = np.asarray(value)
-    except ValueError:
-        return value
-    return values.reshape(-1, *[1] * missing) if values.shape == (sensors,) else value

@@ -93,6 +93,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
     joint: JointErrorCovariance | None = None
     nature: Nature = AS_ASSUMED
     signals = SIGNALS
+    covariance_cycle = 1  # the recursion of the covariances does not depend on time
     extensions = ("actual_covariance",)
 
     @property
@@ -109,11 +110,6 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
     def start_channels(self) -> int:
         """Normals of a start: the state's deviation, the noise scale, nature's."""
         return self.plant.initial_factor.shape[1] + 1 + self.nature.channels
-
-    @property
-    def covariance_cycle(self) -> int:
-        """1: the recursion of the covariances does not depend on time."""
-        return 1
 
     @property
     def observation(self) -> tuple[Block, ...]:

@@ -15,6 +15,7 @@ from scipy.special import ndtr
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
+from fusion_gym.errors import forbidden
 from fusion_gym.systems.linear_plant import covariance_factor
 from fusion_gym.validation import ConfigurationError
 
@@ -37,10 +38,8 @@ def probabilities(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -
     if np.any(values < 0.0) or np.any(np.abs(total - 1.0) > 1e-9):
         what = "rows add up" if values.ndim > 1 else "entries add up"
         sums = np.round(total[..., 0], 12).tolist()
-        raise ConfigurationError(
-            f"{field} = {validation.display(values)} is not allowed: it must have entries from 0 "
-            f"to 1 whose {what} to 1, not {sums}"
-        )
+        reason = f"it must have entries from 0 to 1 whose {what} to 1, not {sums}"
+        raise forbidden(field, values, reason)
     return np.asarray(values / total)
 
 

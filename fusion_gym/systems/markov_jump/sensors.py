@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.errors import forbidden
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw_mode, probabilities
-from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -70,20 +70,17 @@ class FadingSensors:
         matrix = validation.array(
             "measurement_matrices", measurement_matrices, (None, plant.modes, plant.size)
         )
-        sensors, noises = len(matrix), len(plant.noise_covariance)
+        sensors = len(matrix)
         period = validation.spread("sampling_periods", sampling_periods, (sensors,))
         if np.any(period < 1.0) or np.any(period != np.round(period)):
-            raise ConfigurationError(
-                f"sampling_periods = {validation.display(sampling_periods)} is not allowed: "
-                "each must be a whole number >= 1"
-            )
+            reason = "each must be a whole number >= 1"
+            raise forbidden("sampling_periods", sampling_periods, reason)
         values = validation.array("fading_values", fading_values, (sensors, None))
         if np.any(values < 0.0) or np.any(values > 1.0):
-            raise ConfigurationError(
-                f"fading_values = {validation.display(values)} is not allowed: each must be from "
-                "0 to 1"
-            )
+            raise forbidden("fading_values", values, "each must be from 0 to 1")
         variance = validation.positive("measurement_variance", measurement_variance, (sensors,))
+        shape = (sensors, len(plant.noise_covariance))
+        coupling = validation.by_row(noise_coupling, shape)
         return cls(
             measurement_matrix=np.ascontiguousarray(matrix.transpose(0, 2, 1)),
             period=period.astype(np.int64)[:, None],
@@ -91,9 +88,7 @@ class FadingSensors:
             fading_probabilities=probabilities(
                 "fading_probabilities", fading_probabilities, values.shape
             ),
-            noise_coupling=validation.spread(
-                "noise_coupling", _column(noise_coupling, sensors), (sensors, noises)
-            )[..., None],
+            noise_coupling=validation.spread("noise_coupling", coupling, shape)[..., None],
             variance=variance[:, None],
             deviation=np.sqrt(variance)[:, None],
         )
@@ -145,12 +140,3 @@ class FadingSensors:
         result += linalg.dot(self.noise_coupling, process_noise)
         result += self.deviation * noise[self.count :]
         return result
-
-
-def _column(value: ArrayLike, sensors: int) -> ArrayLike:
-    """Return one number per sensor as a column over the noises, other values unchanged."""
-    try:
-        values = np.asarray(value)
-    except ValueError:
-        return value
-    return values[:, None] if values.shape == (sensors,) else value

@@ -20,9 +20,9 @@ from fusion_gym.core.channel import Channel, InitialState
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
+from fusion_gym.errors import forbidden
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.systems.silence import Silence, Trigger
-from fusion_gym.validation import ConfigurationError
 
 _FILTERS: dict[str, type] = {"symmetric": RemoteEstimationSystem, "truncated": Silence}
 
@@ -160,16 +160,14 @@ def _nature(options: RemoteEstimationOptions, coefficient: Array) -> Nature:
 def _channel(options: RemoteEstimationOptions, sensors: int) -> Channel:
     kind = options.channel
     if kind != "gilbert_elliott" and options.channel_transition is not None:
-        raise ConfigurationError(
-            f"channel_transition = {validation.display(options.channel_transition)} is not allowed "
-            f"with channel={kind!r}: it belongs to 'gilbert_elliott'"
-        )
+        where = f"with channel={kind!r}"
+        reason = "it belongs to 'gilbert_elliott'"
+        raise forbidden("channel_transition", options.channel_transition, reason, where)
     if kind == "perfect":
         if options.drop_probability is not None:
-            raise ConfigurationError(
-                f"drop_probability = {validation.display(options.drop_probability)} is not allowed "
-                "with channel='perfect': it belongs to 'independent' and 'gilbert_elliott'"
-            )
+            where = "with channel='perfect'"
+            reason = "it belongs to 'independent' and 'gilbert_elliott'"
+            raise forbidden("drop_probability", options.drop_probability, reason, where)
         return Channel.perfect(sensors)
     drop = _DROP[kind] if options.drop_probability is None else options.drop_probability
     if kind == "independent":

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.errors import forbidden
 from fusion_gym.fusion.rules import FusionRule, InformationFusion
 from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.linear_plant import LinearPlant
@@ -22,7 +23,6 @@ from fusion_gym.systems.tobit.filters import (
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError
 
 Gaussian = tuple[Array, Array]  # mean (…, n, N) and covariance (…, n, n, N)
 Packets = NDArray[np.bool_]
@@ -48,9 +48,16 @@ class CentrePrediction(NamedTuple):
 
 
 class Centre(Protocol):
-    """The interface of nodes and centre."""
+    """The interface of nodes and centre.
+
+    Attributes:
+        separable: Whether :meth:`single` is available, and faster than one update after another.
+        reads_silence: Whether a step without a delivery is information.
+    """
 
     filter: Any
+    separable: ClassVar[bool] = False
+    reads_silence: ClassVar[bool] = False
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -61,16 +68,6 @@ class Centre(Protocol):
     @property
     def predictable(self) -> bool:
         """Whether the covariances depend on the deliveries only."""
-        return False
-
-    @property
-    def separable(self) -> bool:
-        """Whether :meth:`single` is available, and faster than one update after another."""
-        return False
-
-    @property
-    def reads_silence(self) -> bool:
-        """Whether a step without a delivery is information."""
         return False
 
     @property
@@ -162,10 +159,8 @@ class Feedback:
             return cls(np.full((sensors, 1), 1.0 / sensors))
         weights = validation.array("information_shares", share, (sensors,))
         if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
-            raise ConfigurationError(
-                f"information_shares = {validation.display(weights)} is not allowed: they must be "
-                f"> 0 with sum 1 (their sum is {weights.sum():.6g})"
-            )
+            reason = f"they must be > 0 with sum 1 (their sum is {weights.sum():.6g})"
+            raise forbidden("information_shares", weights, reason)
         return cls(weights[:, None])
 
 
@@ -266,11 +261,7 @@ class FederatedCentre(NodeCentre):
     """
 
     filter: KalmanFilter
-
-    @property
-    def separable(self) -> bool:
-        """See :class:`Centre`."""
-        return True
+    separable = True
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` have no effect."""

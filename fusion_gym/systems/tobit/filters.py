@@ -21,7 +21,6 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.namespace import in_runs, namespace
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.validation import ConfigurationError
 
 
 class Expectation(NamedTuple):
@@ -302,10 +301,8 @@ class StochasticEventFilter(KalmanFilter):
             ConfigurationError: no weight, another number of entries, or an entry <= 0.
         """
         if weight is None:
-            raise ConfigurationError(
-                "stochastic_weight = None is not allowed with filter='stochastic': it must be "
-                "the weight of the policy 'stochastic_event', a number > 0, or one per sensor"
-            )
+            allowed = "the weight of the policy 'stochastic_event', a number > 0, or one per sensor"
+            raise validation.refusal("stochastic_weight", None, allowed, "with filter='stochastic'")
         checked = validation.positive("stochastic_weight", weight, (sensors.count,))
         return cls(sensors, checked[:, None])
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.errors import ConfigurationError
+from fusion_gym.errors import ConfigurationError, forbidden
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, Gaussian, Packets
 from fusion_gym.systems.tobit.filters import KalmanFilter
@@ -48,11 +48,7 @@ class HoldCentre(Centre):
 
     filter: KalmanFilter
     plant: LinearPlant
-
-    @property
-    def numpy_only(self) -> str | None:
-        """See :class:`Centre`."""
-        return "filter"
+    numpy_only = "filter"
 
     @functools.cached_property
     def inverse(self) -> Array:
@@ -160,7 +156,5 @@ def hold_centre(
             f"they must determine all {plant.size} states, because a held value has no model"
         )
     if not sensors.unlimited:
-        raise ConfigurationError(
-            "filter = 'hold' is not allowed with censored sensors: a held limit is no measurement"
-        )
+        raise forbidden("filter", "hold", "a held limit is no measurement", "with censored sensors")
     return HoldCentre(KalmanFilter(sensors), plant)

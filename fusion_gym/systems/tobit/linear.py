@@ -187,9 +187,8 @@ def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
     joint, own = options.joint_measurement_covariance, options.measurement_covariances
     default = LinearFusionOptions.measurement_covariances
     if joint is not None and plain_options(own) != default:
-        raise validation.refusal(
-            "measurement_covariances", own, "left out with joint_measurement_covariance"
-        )
+        allowed = "left out with joint_measurement_covariance"
+        raise validation.refusal("measurement_covariances", own, allowed)
     return linear_sensors(
         states,
         options.measurement_matrices,
@@ -219,6 +218,5 @@ def _check_rules(options: LinearFusionOptions) -> None:
         if kind not in (None, "joint", "kalman"):
             raise validation.refusal(name, kind, f"'joint' or 'kalman', {why}")
         if kind == "kalman" and options.fusion not in ("ci", "sci"):
-            raise validation.refusal(
-                "fusion", options.fusion, f"'ci' or 'sci' with {name}='kalman', {why}"
-            )
+            allowed = f"'ci' or 'sci' with {name}='kalman', {why}"
+            raise validation.refusal("fusion", options.fusion, allowed)

@@ -52,11 +52,9 @@ def linear_sensors(
         variances = np.diagonal(covariance)
         if np.count_nonzero(covariance - np.diag(variances)):
             if limited[place]:
-                raise validation.refusal(
-                    f"measurement_covariances[{place}]" if whole is None else _JOINT,
-                    covariance,
-                    f"diagonal for the censored sensor {place}",
-                )
+                name = f"measurement_covariances[{place}]" if whole is None else _JOINT
+                allowed = f"diagonal for the censored sensor {place}"
+                raise validation.refusal(name, covariance, allowed)
             factor, variances = linalg.cholesky(covariance[..., None])[..., 0], np.ones(size)
         matrix[place, :size] = np.linalg.solve(factor, rows[place])
         variance[place, :size] = variances
@@ -65,9 +63,8 @@ def linear_sensors(
     if whole is None or not np.count_nonzero(whole - block_diag(*own)):
         return sensors
     if any(limited):
-        raise validation.refusal(
-            _JOINT, joint, "without correlations between sensors, because some are censored"
-        )
+        allowed = "without correlations between sensors, because some are censored"
+        raise validation.refusal(_JOINT, joint, allowed)
     scale = block_diag(*factors) * np.sqrt(variance[present])
     factor, places = np.eye(present.size), np.flatnonzero(present)
     factor[np.ix_(places, places)] = np.linalg.solve(scale, np.linalg.cholesky(whole))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, plain_options
-from fusion_gym.errors import ConfigurationError, display
+from fusion_gym.errors import forbidden
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.centre import (
@@ -251,6 +251,4 @@ def _refuse(options: FeedbackOptions, names: tuple[str, ...], where: str, belong
     for name in names:
         value = getattr(options, name)
         if value is not None:
-            raise ConfigurationError(
-                f"{name} = {display(value)} is not allowed with {where}: it belongs to {belongs}"
-            )
+            raise forbidden(name, value, f"it belongs to {belongs}", f"with {where}")

@@ -144,9 +144,8 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
     holds = options.filter == "paper" and options.silent != "predict"
     memory_filter = options.memory_filter
     if memory_filter is None and options.filter == "paper":
-        memory_filter = (
-            "adf"  # the paper's minimises a bound; with every measurement it errs thrice
-        )
+        # The paper's minimises a bound; with every measurement it errs thrice.
+        memory_filter = "adf"
     names = tuple(f"x{i + 1}" for i in range(plant.size))
     random = options.random_start
     system = make_system(options, plant, centre, names, horizon, random_start=random)
@@ -190,11 +189,8 @@ def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> 
     """Return the paper's filter, with its constants and the trigger's Ξ."""
     constants = BoundConstants.create(options.bound_epsilon)
     if np.min(options.bound_epsilon) < _SMALLEST_EPSILON:
-        raise validation.refusal(
-            "bound_epsilon",
-            options.bound_epsilon,
-            f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound",
-        )
+        allowed = f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound"
+        raise validation.refusal("bound_epsilon", options.bound_epsilon, allowed)
     trigger = _trigger(options, sensors.count)
     error = EventError.create(**trigger, young=options.bound_young, sensors=sensors.count)
     with_error = options.event_error is None or options.event_error

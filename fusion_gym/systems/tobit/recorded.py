@@ -94,17 +94,13 @@ class RecordedSystem(CensoredSystem):
     )
     level: Array = field(default_factory=lambda: np.empty((0, 5)))
     step: float = 0.0
+    numpy_only = "log"
 
     def _level(self, state: RecordedState, time: Array) -> Array:
         """Return what readings (l, 1, N) have beside deviations."""
         turn = 2.0 * np.pi * (state.day + self.step * time)
         waves = [np.ones_like(turn), np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
         return (self.level @ np.array(waves))[:, None]
-
-    @property
-    def numpy_only(self) -> str | None:
-        """See :class:`System`."""
-        return "log"
 
     @property
     def start_channels(self) -> int:
@@ -423,9 +419,8 @@ def _windows(plant: LinearPlant, part: _Part, horizon: int) -> WindowNoise:
     present = np.array([known[first : first + horizon + 1].mean() for first in starts])
     starts = starts[present >= _READINGS * known.mean()]
     if not len(starts):
-        raise refusal(
-            "horizon", horizon, f"shorter: {len(path):,} steps of the log were not fitted"
-        )
+        allowed = f"shorter: {len(path):,} steps of the log were not fitted"
+        raise refusal("horizon", horizon, allowed)
     root = plant.initial_factor[..., 0]
     moved = (path[starts] - plant.initial_mean[:, 0]) @ np.linalg.pinv(root).T
     still, day = np.zeros_like(moved), part.day[rows:][starts, None]

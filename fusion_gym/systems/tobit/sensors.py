@@ -11,15 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_limits
+from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.systems.linear_plant import Sensors
 
 _RIDGE = 4e-15  # relative, for each state: twice what linalg.root takes for rounding
 _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in its rounding
 
 
 @dataclass(frozen=True)
-class CensoredSensors:
+class CensoredSensors(Sensors):
     """y = clip(C x + v, τ, υ) by component, v ~ N(0, diag(R)), for several sensors of equal size.
 
     A component that a sensor does not have is always zero: its row of C and its ``noise_deviation``
@@ -79,10 +80,8 @@ class CensoredSensors:
         low = validation.spread("censoring_threshold", threshold, shape, infinity=-1)
         high = validation.spread("censoring_upper", upper, shape, infinity=1)
         if np.any(low >= high):
-            raise ConfigurationError(
-                f"censoring_threshold = {validation.display(low)} is not allowed: each must be "
-                f"below censoring_upper = {validation.display(high)}"
-            )
+            reason = f"each must be below censoring_upper = {validation.display(high)}"
+            raise forbidden("censoring_threshold", low, reason)
         uncensored = np.isneginf(low)
         noise = validation.positive("measurement_variance", variance, shape)[..., None]
         here = np.ones(shape) if present is None else np.where(present, 1.0, 0.0)
@@ -98,21 +97,6 @@ class CensoredSensors:
             finite_upper=np.where(np.isposinf(high), 0.0, high)[..., None],
             two_sided=bool(np.isfinite(high).any()),
         )
-
-    @property
-    def count(self) -> int:
-        """Number of sensors."""
-        return self.measurement_matrix.shape[0]
-
-    @property
-    def size(self) -> int:
-        """Number of measured components m of each sensor."""
-        return self.measurement_matrix.shape[1]
-
-    @property
-    def noise_channels(self) -> int:
-        """Standard normals that one measurement of all sensors consumes."""
-        return self.count * self.size
 
     def measure(self, state: Array, noise: Array, departure: Array | None = None) -> Array:
         """Return the censored measurements (sensors, m, N).

@@ -92,6 +92,7 @@ class CensoredSystem(System[CensoredState]):
     nature: Nature = AS_ASSUMED
     known_start: bool = False
     signals = SIGNALS
+    covariance_cycle = 1  # the recursion of the covariances does not depend on time
     extensions = ("state_weights", "with_model")
 
     def with_possible(self, state: CensoredState, possible: NDArray[np.bool_]) -> CensoredState:
@@ -166,11 +167,6 @@ class CensoredSystem(System[CensoredState]):
         if capability == "single_deliveries":
             return self.centre.separable
         return super().offers(capability)
-
-    @property
-    def covariance_cycle(self) -> int:
-        """1: the recursion of the covariances does not depend on time."""
-        return 1
 
     @property
     def observation(self) -> tuple[Block, ...]:

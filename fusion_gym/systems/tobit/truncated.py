@@ -68,28 +68,12 @@ class TruncatedCentre(FederatedCentre):
 
     silence: Silence
 
+    predictable = False
+    separable = False
+    reads_silence = True
+    numpy_only = "filter"
     local_means = Centre.local_means
     variances = Centre.variances
-
-    @property
-    def predictable(self) -> bool:
-        """See :class:`Centre`."""
-        return False
-
-    @property
-    def separable(self) -> bool:
-        """See :class:`Centre`."""
-        return False
-
-    @property
-    def reads_silence(self) -> bool:
-        """See :class:`Centre`."""
-        return True
-
-    @property
-    def numpy_only(self) -> str | None:
-        """See :class:`Centre`."""
-        return "filter"
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``time`` has no effect."""

@@ -137,7 +137,8 @@ def _radius(joint: JointGain, model: InputModel, epsilon: Array, noise: Array) -
         covariance = joint.covariance(gain, before, noise)
         if not np.all(np.abs(covariance) < _UNBOUNDED):
             break
-    rest = linalg.identity(model.size) - linalg.matmul(gain[:, : model.size], joint.sensors.matrix)
+    seen = linalg.matmul(gain[:, : model.size], joint.sensors.measurement_matrix)
+    rest = linalg.identity(model.size) - seen
     closed = linalg.matmul(rest, model.transition)[..., 0] * np.sqrt(growth[..., 0])
     radius: Array = np.abs(np.linalg.eigvals(closed)).max(-1)
     return radius

@@ -19,6 +19,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.admission import LARGEST_ERROR
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
+from fusion_gym.errors import forbidden
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
@@ -154,21 +155,16 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
     trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
     if np.any(open_loop[plant.size :] <= 0.0):
-        raise ConfigurationError(
-            f"input_signal = {validation.display(options.input_signal)} is not allowed with "
-            f"input_amplitude = {validation.display(options.input_amplitude)}: every input must "
-            "differ from zero at some step before the horizon"
-        )
+        where = f"with input_amplitude = {validation.display(options.input_amplitude)}"
+        reason = "every input must differ from zero at some step before the horizon"
+        raise forbidden("input_signal", options.input_signal, reason, where)
     if np.any(open_loop <= 0.0):
-        raise ConfigurationError(
-            f"process_covariance = {validation.display(options.process_covariance)} is not "
-            "allowed: every state must have an input or noise before the horizon, or an "
-            "uncertain start"
-        )
+        reason = "every state must have an input or noise before the horizon, or an uncertain start"
+        raise forbidden("process_covariance", options.process_covariance, reason)
     weights = _weights(options, open_loop, plant.inputs)
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    plant.warn_of_unseen_growth(sensors.matrix, _state_names(options, plant))
+    plant.warn_of_unseen_growth(sensors.measurement_matrix, _state_names(options, plant))
     system = UnknownInputSystem(
         plant=plant,
         signal=signal,
@@ -262,10 +258,8 @@ def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSig
     if kind == "sinusoids":
         return Sinusoids.create(inputs, amplitude, period, phase)
     if not (isinstance(phase, str) and phase == "random"):
-        raise ConfigurationError(
-            f"input_phase = {validation.display(phase)} is not allowed with "
-            f"input_signal={kind!r}: phases belong to 'sinusoids'"
-        )
+        reason = "phases belong to 'sinusoids'"
+        raise forbidden("input_phase", phase, reason, f"with input_signal={kind!r}")
     if kind == "steps":
         return Steps.create(inputs, amplitude, period)
     return MeanRevertingWalk.create(inputs, amplitude, period)
@@ -291,10 +285,8 @@ def _nodes(
     fusion = NodeFusion(rule, plant.size, options.fusion == "ci", weights)
     hold = options.hold_variance
     if hold is not None and kind != "random_walk":
-        raise ConfigurationError(
-            f"hold_variance = {validation.display(hold)} is not allowed with filter={kind!r}: it "
-            "belongs to filter='random_walk'"
-        )
+        reason = "it belongs to filter='random_walk'"
+        raise forbidden("hold_variance", hold, reason, f"with filter={kind!r}")
     if kind == "paper":
         bound = _required(options.rho_bar)
         tables = BoundTables.create(joint, model, bound, factor, horizon)

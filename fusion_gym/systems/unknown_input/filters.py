@@ -129,7 +129,7 @@ class RandomWalkInputFilter:
             noise: covariance of the measurement (l, m, m, N or 1).
         """
         n = self.model.size
-        matrix = self.sensors.matrix
+        matrix = self.sensors.measurement_matrix
         cross = linalg.matmul(prior[:, :, :n], linalg.transpose(matrix))
         innovation = linalg.matmul(matrix, cross[:, :n]) + noise
         if self.sensors.size == 1:

@@ -152,11 +152,8 @@ def tracked_intersection(
     if lanes.size:
         own = None if basis is None else basis[..., lanes]
         best = covariance_intersection_many(mean[..., lanes], covariance[..., lanes], basis=own)
-        joined[:, lanes], fused[..., lanes], weights[:, lanes] = (
-            best.mean,
-            best.covariance,
-            best.weights,
-        )
+        joined[:, lanes], fused[..., lanes] = best.mean, best.covariance
+        weights[:, lanes] = best.weights
 
     def gains() -> Array:
         every = linalg.matmul(fused, weights[:, None, None] * information)

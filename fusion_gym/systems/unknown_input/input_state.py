@@ -54,8 +54,8 @@ class JointGain:
         free = u.shape[-2]
         if not free:
             return np.broadcast_to(self.onto, (*self.onto.shape[:-1], covariance.shape[-1])).copy()
-        cross = linalg.matmul(covariance, linalg.transpose(sensors.matrix))
-        innovation = linalg.matmul(sensors.matrix, cross) + noise
+        cross = linalg.matmul(covariance, linalg.transpose(sensors.measurement_matrix))
+        innovation = linalg.matmul(sensors.measurement_matrix, cross) + noise
         through = linalg.matmul(innovation, u)
         weight = linalg.matmul(linalg.transpose(u), through)
         target = -linalg.matmul(self.onto, through)
@@ -70,7 +70,7 @@ class JointGain:
     def covariance(self, gain: Array, covariance: Array, noise: Array) -> Array:
         """Return the covariance M Φ Mᵀ + 𝒢 R 𝒢ᵀ (l, s, s, N) of any such gain, M = [I; 0] - 𝒢 C."""
         n = covariance.shape[1]
-        moved = -linalg.matmul(gain, self.sensors.matrix)
+        moved = -linalg.matmul(gain, self.sensors.measurement_matrix)
         for row in range(n):
             moved[:, row, row] += 1.0
         return linalg.congruence(moved, covariance) + linalg.congruence(gain, noise)

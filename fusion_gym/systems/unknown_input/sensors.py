@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.systems.linear_plant import Sensors
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.validation import ConfigurationError
 
@@ -19,17 +20,17 @@ _RANK = 1e-8  # singular values below this share of what they could be count as 
 
 
 @dataclass(frozen=True)
-class InputSensors:
+class InputSensors(Sensors):
     """y_i(k) = C_i x(k) + ν_i(k), ν_i ~ N(0, V_i), with an input that every sensor can observe.
 
-    Shapes: ``matrix`` C (l, m, n, 1), ``covariance`` V (l, m, m, 1), ``factor`` (l, m, m, 1) with
-    factor factorᵀ = V. From the plant: ``inverse`` (C ℬ)⁺ (l, q, m, 1) and ``complement`` U
-    (l, m, m - q, 1), an orthonormal basis of the kernel of (C ℬ)ᵀ.
+    Shapes: ``measurement_matrix`` C (l, m, n, 1), ``covariance`` V (l, m, m, 1), ``factor``
+    (l, m, m, 1) with factor factorᵀ = V. From the plant: ``inverse`` (C ℬ)⁺ (l, q, m, 1) and
+    ``complement`` U (l, m, m - q, 1), an orthonormal basis of the kernel of (C ℬ)ᵀ.
 
     Source: unknown_input, equation (2).
     """
 
-    matrix: Array
+    measurement_matrix: Array
     covariance: Array
     factor: Array
     inverse: Array
@@ -50,8 +51,7 @@ class InputSensors:
             ConfigurationError: a wrong shape, a V_i that is not positive definite, or a sensor that
                 cannot observe the input: rank(C_i ℬ) below the number of inputs.
         """
-        c = validation.array("measurement_matrices", matrices, (None, None, None))
-        c = validation.array("measurement_matrices", matrices, (*c.shape[:2], plant.size))
+        c = validation.array("measurement_matrices", matrices, (None, None, plant.size))
         noise = _noise_covariances(covariances, *c.shape[:2])
         inverses, complements = [], []
         for sensor, matrix in enumerate(c):
@@ -59,37 +59,23 @@ class InputSensors:
             inverses.append(inverse)
             complements.append(complement)
         return cls(
-            matrix=c[..., None],
+            measurement_matrix=c[..., None],
             covariance=noise[..., None],
             factor=np.asarray(np.linalg.cholesky(noise), dtype=np.float64)[..., None],
             inverse=np.array(inverses)[..., None],
             complement=np.array(complements)[..., None],
         )
 
-    @property
-    def count(self) -> int:
-        """Number of sensors l."""
-        return self.matrix.shape[0]
-
-    @property
-    def size(self) -> int:
-        """Number of measured components m of each sensor."""
-        return self.matrix.shape[1]
-
-    @property
-    def noise_channels(self) -> int:
-        """Standard normals that one measurement of all sensors consumes."""
-        return self.count * self.size
-
     def measure(self, state: Array, noise: Array) -> Array:
         """Return measurements (l, m, N) of the state (n, N) with standard normals (l·m, N)."""
-        result = linalg.matvec(self.matrix, state)
+        result = linalg.matvec(self.measurement_matrix, state)
         result += linalg.matvec(self.factor, noise.reshape(self.count, self.size, -1))
         return result
 
     def expect(self, mean: Array) -> Array:
         """Return C x̂ (l, m, N) of means (l, s, N) or (s, N) that begin with the n states."""
-        return linalg.matvec(self.matrix, mean[..., : self.matrix.shape[2], :])
+        matrix = self.measurement_matrix
+        return linalg.matvec(matrix, mean[..., : matrix.shape[2], :])
 
 
 def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
@@ -105,8 +91,7 @@ def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
                 for i, value in enumerate(values)
             ]
         )
-    if values.shape == (sensors,):
-        value = values[:, None]
+    value = validation.by_row(value, (sensors, size))
     variances = validation.positive("measurement_covariance", value, (sensors, size))
     return variances[..., None] * np.eye(size)
 

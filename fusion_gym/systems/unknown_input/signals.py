@@ -16,7 +16,6 @@ from scipy.special import ndtr
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.validation import ConfigurationError
 
 
 class InputSignal(ABC):
@@ -243,10 +242,8 @@ def _scale_and_period(size: int, amplitude: ArrayLike, period: ArrayLike) -> tup
     scale = validation.positive("input_amplitude", amplitude, (size,))
     instants = validation.positive("input_period", period, (size,))
     if np.any(instants < 1.0):
-        raise ConfigurationError(
-            f"input_period = {validation.display(instants)} is not allowed: it must be >= 1 "
-            "everywhere, because an input is constant between two sampling instants"
-        )
+        allowed = ">= 1 everywhere, because an input is constant between two sampling instants"
+        raise validation.refusal("input_period", instants, allowed)
     return scale[:, None], instants[:, None]
 
 

@@ -83,6 +83,7 @@ class UnknownInputSystem(System[UnknownInputState]):
     reference: Array
     nature: Nature = AS_ASSUMED
     signals = SIGNALS
+    covariance_cycle = 1  # the recursion of the covariances does not depend on time
 
     @property
     def sensor_count(self) -> int:
@@ -114,11 +115,6 @@ class UnknownInputSystem(System[UnknownInputState]):
         if capability in ("imagine", "imagination_channels"):
             return self.signal.start_channels > 0
         return super().offers(capability)
-
-    @property
-    def covariance_cycle(self) -> int:
-        """1: the recursion of the covariances does not depend on time."""
-        return 1
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -307,16 +303,17 @@ class UnknownInputSystem(System[UnknownInputState]):
         plant, sensors = self.plant, self.nodes.sensors
         moments = plant.second_moments(self.signal, horizon, plant.initial_mean[:, 0])
         deviation = np.sqrt(linalg.diagonal(sensors.covariance))
-        return largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation), 0.0
+        rows = sensors.measurement_matrix[..., 0] / deviation
+        return largest_ratio(moments[:, : plant.size], rows), 0.0
 
     def _deviation(self, state: UnknownInputState) -> Array:
         """Return the innovation's deviation (l, m, N or 1)."""
         n, sensors = self.plant.size, self.nodes.sensors
         prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
-        spread = linalg.matmul(sensors.matrix, prior[:, :n, :n])
-        variance = spread[..., 0, :] * sensors.matrix[..., 0, :]
+        spread = linalg.matmul(sensors.measurement_matrix, prior[:, :n, :n])
+        variance = spread[..., 0, :] * sensors.measurement_matrix[..., 0, :]
         for column in range(1, n):
-            variance += spread[..., column, :] * sensors.matrix[..., column, :]
+            variance += spread[..., column, :] * sensors.measurement_matrix[..., column, :]
         variance += linalg.diagonal(sensors.covariance)
         return np.sqrt(variance, out=variance)
 
