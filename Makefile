@@ -10,7 +10,7 @@ QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_envir
 	tests/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
 	tests/test_benchmark.py::test_from_prices_to_pages_and_zoo
 
-.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers zoo newcomer docs integrations \
+.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers zoo newcomer pages docs integrations \
 	integrations-tianshou integrations-rejax integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
@@ -135,7 +135,11 @@ $(VENV)/.docs: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,docs]'
 	touch $@
 
+pages: $(STAMP)  ## the tables of the pages in docs/, from the code
+	$(BIN)/python -m docs.tables
+
 docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links and length of its prose checked
+	$(BIN)/python -m docs.tables --check
 	$(BIN)/python tests/prose.py
 	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -c docs -d runs/docs/doctrees . site/html
 	echo '<meta http-equiv="refresh" content="0; url=html/docs/index.html">' > site/index.html

@@ -2,25 +2,22 @@
 
 import os
 import sys
-from pathlib import Path
 
 from fusion_gym.version import __version__
 
-sys.path.insert(0, str(Path(__file__).parent))
-os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+os.environ["PATH"] = os.pathsep.join((os.path.dirname(sys.executable), os.environ["PATH"]))
 
 project, author, release = "fusion-gym", "the authors of fusion-gym", __version__
 project_copyright = author
 root_doc = "docs/index"
 include_patterns = ["*.md", "docs/**", "results/**"]
-exclude_patterns = []
 extensions = [
     "myst_nb",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "sphinx-mathjax-offline",
-    "site_extension",
+    "docs.site_extension",
 ]
 
 html_theme = "furo"
@@ -32,11 +29,10 @@ html_use_index = False
 html_theme_options = {
     "source_repository": "https://github.com/fusion-gym/fusion-gym/",
     "source_branch": "main",
-    "source_directory": "",
 }
 
 # The Python of a page runs in a kernel of its own, in an empty folder; unchanged pages are cached.
-nb_custom_formats = {".md": ("site_extension.read_page", {}, False)}
+nb_custom_formats = {".md": ("docs.site_extension.read_page", {}, False)}
 nb_execution_mode = "cache"
 nb_execution_cache_path = "runs/docs/notebooks"
 nb_execution_in_temp = True
@@ -49,7 +45,6 @@ myst_heading_anchors = 4
 # A heading may begin below the first level, as in an environment's sections.
 suppress_warnings = ["myst.header", "mystnb.unknown_mime_type"]
 
-autosummary_generate = True
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"

@@ -1,4 +1,4 @@
-"""What the site adds to Sphinx: pages as notebooks, tables of declarations, formulas."""
+"""What the site adds to Sphinx: pages as notebooks, links to names, folds, formulas."""
 
 import html
 import re
@@ -7,15 +7,8 @@ from typing import Any
 import nbformat
 from docutils import nodes
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from sphinx.addnodes import download_reference, pending_xref
 from sphinx.application import Sphinx
-from sphinx.util.docutils import SphinxDirective
-
-import fusion_gym
-from fusion_gym.docstrings import table
-from fusion_gym.envs.pages import TABLES
-from fusion_gym.envs.registration import options_of
-from fusion_gym.envs.views import make_view
-from fusion_gym.importing import import_named
 
 _CODE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"^```\w+\n(# (\w+\.(?:py|yaml))\n.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -47,40 +40,12 @@ def read_page(text: str) -> nbformat.NotebookNode:
     return new_notebook(cells=cells, metadata=metadata)
 
 
-class DeclarationTable(SphinxDirective):
-    """A table of what the code declares; its name is a kind of ``fusion_gym.envs.pages``."""
-
-    required_arguments, final_argument_whitespace = 1, True
-
-    def run(self) -> list[nodes.Node]:
-        """Parse the table."""
-        make = import_named("table", TABLES[self.name.removesuffix("-table")])
-        return self.parse_text_to_nodes(make(" ".join(self.arguments[0].split())))
-
-
-class EnvironmentFacts(SphinxDirective):
-    """A table of what a registered environment is."""
-
-    required_arguments = 1
-
-    def run(self) -> list[nodes.Node]:
-        """Parse the table."""
-        env_id = self.arguments[0]
-        task = fusion_gym.make_task(env_id)
-        view, kind = make_view(task), options_of(env_id)
-        filters = (f"`{name or owner.__name__}`" for name, owner in kind.filters.items())
-        rows = [
-            ("id", f"`{env_id}`"),
-            ("sensors", str(task.sensors)),
-            ("states", ", ".join(f"`{name}`" for name in task.system.state_names)),
-            ("observation", f"{len(view.names)} float32 numbers"),
-            ("action", f"`{view.actions}`"),
-            ("steps of an episode", str(task.horizon)),
-            ("filters", ", ".join(filters) or "–"),
-        ]
-        if kind.structure is not None:
-            rows.append(("fusion", ", ".join(f"`{name}`" for name in kind.structure.offered)))
-        return self.parse_text_to_nodes(table(("", env_id.split("/")[1]), rows))
+def lead_to_names(app: Sphinx, doctree: nodes.document) -> None:
+    """Lead a link from a name to its source file to the page of the name."""
+    for node in list(doctree.findall(download_reference)):
+        if "/fusion_gym/" in node["reftarget"] and ".py" not in (name := node.astext()):
+            target = {"refdomain": "py", "reftype": "obj", "reftarget": name}
+            node.replace_self(pending_xref("", *node.children, **target, refspecific=True))
 
 
 def fold(app: Sphinx, doctree: nodes.document, name: str) -> None:
@@ -124,10 +89,8 @@ def write_formulas(
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directives and the reader of docstrings."""
-    for kind in TABLES:
-        app.add_directive(f"{kind}-table", DeclarationTable)
-    app.add_directive("environment-facts", EnvironmentFacts)
+    """Connect the changes of pages and docstrings."""
+    app.connect("doctree-read", lead_to_names, priority=400)  # before files to download are copied
     app.connect("doctree-resolved", fold)
     app.connect("autodoc-process-docstring", write_formulas)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -14,7 +14,8 @@ ROOT = Path(__file__).parent.parent
 WORDS = {"docs": 20_000, "results": 2_000}
 MEAN, LONGEST, LONGER = 17, 25, 5
 BLOCKS = re.compile(
-    r"(?ms)```.*?^ *```|\$\$.*?\$\$|<!--.*?-->|</?\w[^>\n]*>|^ *(?:\||#|>>>|\.\.\.)[^\n]*$"
+    r"(?ms)<!-- table: .*?<!-- end -->|```.*?^ *```|\$\$.*?\$\$"
+    r"|<!--.*?-->|</?\w[^>\n]*>|^ *(?:\||#|>>>|\.\.\.)[^\n]*$"
 )
 LITERAL = re.compile(r"(?s):\w+:`.*?`|``.*?``|`.*?`|\$.*?\$")
 PARAGRAPH = re.compile(r"\n\s*\n|\n\s*(?:[-*]|\d+\.)\s|\n\s+(?=\w+:\s)")
@@ -30,13 +31,12 @@ def sentences(text: str) -> Iterator[int]:
 
 def docstrings() -> Iterator[str]:
     """Yield the docstrings of the objects of the reference, with their public members."""
-    for page in ("reference", "rules", "filters"):
-        text = (ROOT / f"docs/{page}.md").read_text()
-        for name in re.findall(r"^   (fusion_gym\.[\w.]+)$", text, re.MULTILINE):
-            owner = import_named("name", ":".join(name.rsplit(".", 1)))
-            members = vars(owner).items() if isinstance(owner, type) else ()
-            for member in (owner, *(value for key, value in members if key[0] != "_")):
-                yield inspect.getdoc(member) or ""
+    text = (ROOT / "docs/names.rst").read_text()
+    for name in re.findall(r"^   (fusion_gym\.[\w.]+)$", text, re.MULTILINE):
+        owner = import_named("name", ":".join(name.rsplit(".", 1)))
+        members = vars(owner).items() if isinstance(owner, type) else ()
+        for member in (owner, *(value for key, value in members if key[0] != "_")):
+            yield inspect.getdoc(member) or ""
 
 
 def main() -> str | None:

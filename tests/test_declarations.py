@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from docs.tables import task_of
 from fusion_gym.docstrings import read
-from fusion_gym.envs.pages import task_of
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.evaluation.metrics import METRICS
 from fusion_gym.fusion.table import RULES

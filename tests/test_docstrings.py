@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 import pytest
-from test_site import listed
+from test_site import in_reference
 
 from fusion_gym.core.options import CommonOptions
 from fusion_gym.envs import registration
@@ -14,7 +14,7 @@ from fusion_gym.envs.option_text import options_in
 from fusion_gym.importing import import_named
 from fusion_gym.policies import registry
 
-NAMES = sorted(listed("reference.md"))
+NAMES = sorted(in_reference())
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 import yaml
-from page_blocks import blocks_of
+from markdown_it import MarkdownIt
+from page_blocks import LANGUAGES, blocks_of
 
 import fusion_gym
 from agents.benchmark.report import headline_text
 from agents.benchmark.settings import load_suite
 from agents.benchmark.tables import SavingRow, read_rows
+from docs.tables import PART, TABLES, written
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 
@@ -94,8 +96,31 @@ def test_every_option_and_entry_has_a_meaning_and_a_table(env_id: str) -> None:
     meanings |= {block.name: block.meaning for block in blocks}
     assert not [name for name, meaning in meanings.items() if not meaning]
     page = doc_of(env_id)
-    assert re.search(rf"{{options-table}} .*{env_id}", page)
-    assert "{observation-table} " in page
+    assert re.search(rf"<!-- table: options .*{env_id}", page)
+    assert "<!-- table: observation " in page
+
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_page_is_plain_markdown_with_the_tables_of_the_code(path: Path) -> None:
+    text, markdown = path.read_text(), MarkdownIt().enable("table")
+    assert text == written(text)
+    words = {token.info for token in markdown.parse(text) if token.type == "fence"}
+    assert words <= {*LANGUAGES, "", "bibtex", "console", "json", "text", "{toctree}"}
+    assert "{toctree}" not in words or path.name == "index.md"
+    parts = [part[0] for part in PART.finditer(text)]
+    assert len(parts) == len(
+        re.findall(rf"^<!-- table: (?:{'|'.join(TABLES)})\s", text, re.MULTILINE)
+    )
+    for part in parts:
+        assert "<table>" in markdown.render(part)
+        assert not re.search(r"``|:\w+:`", part)
+        inner = [token for block in markdown.parse(part) for token in block.children or []]
+        assert "html_inline" not in {token.type for token in inner}
+        links = [str(token.attrs["href"]) for token in inner if token.type == "link_open"]
+        assert all((path.parent / link).exists() for link in links)
 
 
 def test_the_bibliography_has_every_paper_that_an_environment_names() -> None:

@@ -1,21 +1,12 @@
-"""An environment's page, written from the declarations of options, blocks and spaces.
+"""An environment's page and its tables, from the declarations of options, blocks and spaces."""
 
-The documentation's directive ``KIND-table``, KIND a name of ``TABLES``, writes a table from its
-text. ``observation`` takes ``ID name=value``; after a semicolon follow other options, whose
-additional entries the table marks. ``options`` takes ids and names of options.
-"""
-
-import ast
 import re
-import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from fusion_gym.core.communication import FEATURES
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import (
-    ObservationLayout,
     belief_blocks,
     block_entries,
     network_blocks,
@@ -28,7 +19,6 @@ from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import list_options, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
 from fusion_gym.envs.views import is_received, make_view
-from fusion_gym.fusion.table import RULES
 
 LEGEND = """\
 A star marks entries that only the sensors know; `information="centre"` omits them. The third column
@@ -49,22 +39,10 @@ _BELIEFS: dict[Owner, str] = {
     "own": "only with `memory=True` or `belief_features`, for local sensors",
 }
 _SEES = {"own": "its own", "broadcast": "all", "hidden": "none"}
-_WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
 _ACTIONS = {
     "single": "0 is no request, m requests sensor m - 1",
     "binary": "A 1 requests the sensor",
     "discrete": "The number has a bit for each sensor, the lowest bit for sensor 0",
-}
-_LONGEST = 60  # characters of a default in a table
-# The function "module:name" that writes the table of each directive.
-TABLES = {
-    "observation": f"{__name__}:observation_text",
-    "options": f"{__name__}:option_table",
-    "filters": f"{__name__}:filter_table",
-    "fusion": f"{__name__}:fusion_table",
-    "policies": "fusion_gym.policies.registry:policy_table",
-    "metrics": "fusion_gym.evaluation.metrics:metric_table",
-    "algorithms": "fusion_gym.training.algorithms:algorithm_table",
 }
 
 _QUEUE = ", sensors share limited tokens in turns"
@@ -132,60 +110,6 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     return table(("entries", "range", "a sensor observes", "meaning"), rows.values())
 
 
-def option_table(text: str) -> str:
-    """Return options of one or more environments as a Markdown table.
-
-    Args:
-        text: Ids of environments with the same options, and names of options; without a name all.
-    """
-    words = text.split()
-    every = [options_in(options_of(word)) for word in words if "/" in word]
-    names = [word for word in words if "/" not in word] or list(every[0])
-    rows = []
-    for name in names:
-        types = (_WORDS.get(part, f"`{part}`") for part in every[0][name].type.split(" | "))
-        defaults = dict.fromkeys(f"`{short(options[name].default)}`" for options in every)
-        cells = " or ".join(types), "; ".join(d if len(d) < _LONGEST else "…" for d in defaults)
-        rows.append((f"`{name}`", *map(_double, cells), plain_marks(every[0][name].meaning)))
-    return table(("option", "type", "default", "meaning"), rows)
-
-
-def observation_text(marker: str) -> str:
-    """Return legend, table and size of an observation.
-
-    Args:
-        marker: ``ID name=value …``, and other options after a semicolon.
-    """
-    first, *others = marker.split(";")
-    env_id, *options = shlex.split(first)
-    value, task = _listed(options), task_of(first)
-    rest = [(_listed(shlex.split(text)), task_of(f"{env_id} {text}")) for text in others]
-    count = len(ObservationLayout(task).names)
-    states = ", ".join(f"`{name}`" for name in task.system.state_names)
-    last = f"With {value or 'the defaults'} these are {count} numbers; states: {states}."
-    return f"{LEGEND}\n\n{observation_table(task, *rest)}\n\n{last}"
-
-
-def task_of(text: str) -> Task:
-    """Return the task of the text ``ID name=value …``."""
-    env_id, *options = shlex.split(text)
-    return make_task(env_id, **_options(options))
-
-
-def filter_table(env_id: str) -> str:
-    """Return the values of an environment's option ``filter`` with their meanings."""
-    filters = options_of(env_id).filters.items()
-    rows = ((f'`"{name}"`', plain_marks(read(kind).summary)) for name, kind in filters)
-    return table(("`filter`", "meaning"), rows)
-
-
-def fusion_table(env_id: str) -> str:
-    """Return the values of an environment's option ``fusion`` with their meanings."""
-    structure = options_of(env_id).structure
-    names = [] if structure is None else structure.offered
-    return table(("`fusion`", "meaning"), ((f'`"{name}"`', RULES[name].meaning) for name in names))
-
-
 def _paragraphs(kind: type[CommonOptions]) -> list[str]:
     text = read(kind).text
     # The default docstring of a dataclass is its signature.
@@ -217,24 +141,3 @@ def _axis(task: Task, block: Block, place: int) -> str:
     if labels == task.system.state_names:
         return "state"
     return "component" if place and labels == numbered(len(labels)) else "/".join(labels)
-
-
-def _options(words: list[str]) -> dict[str, Any]:
-    """Return options from ``name=value``, where the value is a Python literal or a string."""
-    result: dict[str, Any] = {}
-    for name, _, value in (word.partition("=") for word in words):
-        try:
-            result[name] = ast.literal_eval(value)
-        except (SyntaxError, ValueError):
-            result[name] = value
-    return result
-
-
-def _listed(words: list[str]) -> str:
-    output = (f"{name}={value!r}" for name, value in _options(words).items())
-    return _double(", ".join(f"`{text}`" for text in output))
-
-
-def _double(text: str) -> str:
-    """Return the text with double quotes."""
-    return text.replace("'", '"')

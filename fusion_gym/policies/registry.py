@@ -17,7 +17,6 @@ import numpy as np
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE, SignalError
 from fusion_gym.core.task import Task
-from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.importing import TRUST, import_named
 from fusion_gym.policies.base import Policy, guard, owner_of
 from fusion_gym.policies.settings import parse_settings
@@ -153,17 +152,6 @@ def policy_maker(name: str) -> Maker:
 def policy_parameters(name: str) -> dict[str, inspect.Parameter]:
     """Return the parameters that a text may set, in the maker's order."""
     return _parameters(name, policy_maker(name))
-
-
-def policy_table(kind: Kind) -> str:
-    """Return the policies of a kind as a Markdown table, from their declarations."""
-    rows = []
-    for name in policy_names(kind):
-        value = list(policy_parameters(name))
-        text = f"`{name}:{value.pop(0).upper()}`" if kind == "agent" else f"`{name}`"
-        summary = plain_marks(read(policy_maker(name)).summary)
-        rows.append((text, summary, ", ".join(f"`{key}`" for key in value)))
-    return table(("policy", "meaning", "parameters"), rows)
 
 
 def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:

@@ -1,0 +1,153 @@
+"""Write the tables of the pages: ``python -m docs.tables``; ``--check`` refuses old tables.
+
+``TABLES`` has the kinds. A table stands between ``<!-- table: KIND TEXT -->`` and ``<!-- end -->``.
+"""
+
+import inspect
+import pydoc
+import re
+import sys
+from pathlib import Path
+from typing import Any, cast
+
+from fusion_gym.core.system import MEANING
+from fusion_gym.core.task import Task
+from fusion_gym.docstrings import plain_marks, read, table
+from fusion_gym.envs import pages
+from fusion_gym.envs.option_text import options_in, short
+from fusion_gym.envs.registration import make_task, options_of
+from fusion_gym.envs.views import make_view
+from fusion_gym.evaluation.metrics import metric_table
+from fusion_gym.fusion.table import RULES
+from fusion_gym.policies.registry import Kind, policy_maker, policy_names, policy_parameters
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.training.algorithms import algorithm_table
+
+_WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
+
+
+def fact_table(env_id: str) -> str:
+    """Return what a registered environment is."""
+    view = make_view(task := make_task(env_id))
+    rows = [
+        ("sensors", str(task.sensors)),
+        ("states", ", ".join(f"`{name}`" for name in task.system.state_names)),
+        ("observation", f"{len(view.names)} float32 numbers"),
+        ("action", f"`{view.actions}`"),
+        ("steps of an episode", str(task.horizon)),
+    ]
+    return table(("id", f"`{env_id}`"), rows)
+
+
+def observation_table(text: str) -> str:
+    """Return the blocks of an observation below their legend.
+
+    Args:
+        text: ``ID name=value …``; after a semicolon other options, whose additional blocks the
+            table marks.
+    """
+    first, *others = text.split("; ")
+    rest = [(f"`{other}`", task_of(f"{first.split()[0]} {other}")) for other in others]
+    return f"{pages.LEGEND}\n\n{pages.observation_table(task_of(first), *rest)}"
+
+
+def option_table(text: str) -> str:
+    """Return options of one or more environments.
+
+    Args:
+        text: Ids of environments with the same options, and names of options; without a name all.
+    """
+    words = text.split()
+    every = [options_in(options_of(word)) for word in words if "/" in word]
+    names = [word for word in words if "/" not in word] or list(every[0])
+    rows = []
+    for name in names:
+        types = (_WORDS.get(part, f"`{part}`") for part in every[0][name].type.split(" | "))
+        defaults = dict.fromkeys(f"`{short(options[name].default)}`" for options in every)
+        cells = " or ".join(types), "; ".join(d if len(d) < 60 else "…" for d in defaults)
+        quoted = (cell.replace("'", '"') for cell in cells)
+        rows.append((f"`{name}`", *quoted, plain_marks(every[0][name].meaning)))
+    return table(("option", "type", "default", "meaning"), rows)
+
+
+def task_of(text: str) -> Task:
+    """Return the task of the text ``ID name=value …``."""
+    env_id, *options = text.split()
+    return make_task(env_id, **parse_settings("option", options))
+
+
+def filter_table(env_id: str) -> str:
+    """Return the values of an environment's option ``filter``."""
+    rows = (
+        (f'`"{name}"`' if name else "–", _link(owner), _meaning(owner))
+        for name, owner in options_of(env_id).filters.items()
+    )
+    return table(("`filter`", "class", "meaning"), rows)
+
+
+def fusion_table(text: str) -> str:
+    """Return the values of the option ``fusion`` of an environment, or of ``all``."""
+    rows = (
+        (f'`"{name}"`', _link(type(row.make())), row.assumes, plain_marks(row.meaning))
+        for name, row in RULES.items()
+        if text == "all" or name in getattr(options_of(text).structure, "offered", ())
+    )
+    return table(("`fusion`", "class", "assumes", "meaning"), rows)
+
+
+def policy_table(text: str) -> str:
+    """Return the policies of a kind: the columns that the text names after the kind."""
+    kind, *columns = text.split()
+    rows = []
+    for name in policy_names(cast(Kind, kind)):
+        maker, parameters = policy_maker(name), list(policy_parameters(name))
+        knowledge = getattr(maker, "knowledge", None)
+        cells = {
+            "policy": f"`{name}:{parameters.pop(0).upper()}`" if kind == "agent" else f"`{name}`",
+            "class": _link(maker),
+            "meaning": _meaning(maker),
+            "knowledge": MEANING[knowledge] if knowledge in MEANING else _meaning(knowledge),
+            "parameters": ", ".join(f"`{key}`" for key in parameters),
+        }
+        rows.append(tuple(cells[column] for column in columns))
+    return table(tuple(columns), rows)
+
+
+def name_table(text: str) -> str:
+    """Return the names of names.rst that a regular expression matches."""
+    lines = Path(__file__).with_name("names.rst").read_text(encoding="utf-8").split()
+    owners = {line: pydoc.locate(line) for line in lines if re.fullmatch(text, line)}
+    rows = ((_link(owner, name), _meaning(owner)) for name, owner in owners.items())
+    return table(("name", "meaning"), rows)
+
+
+TABLES = {
+    "algorithms": algorithm_table, "facts": fact_table, "filters": filter_table,
+    "fusion": fusion_table, "metrics": metric_table, "names": name_table,
+    "observation": observation_table, "options": option_table, "policies": policy_table,
+}  # fmt: skip
+PART = re.compile(r"(?ms)^(<!-- table: (\w+)\s([^>]+?)\s-->\n).*?^(<!-- end -->)$")
+
+
+def written(text: str) -> str:
+    """Return a page with its tables as the code has them now."""
+    return PART.sub(lambda part: f"{part[1]}\n{TABLES[part[2]](part[3])}\n\n{part[4]}", text)
+
+
+def _link(owner: Any, text: str = "") -> str:
+    """Return a name as a link to its source; the site leads it to the name's own page."""
+    path = Path(inspect.getsourcefile(owner) or "").relative_to(Path(pages.__file__).parents[2])
+    return f"[`{text or owner.__name__}`](../{path.as_posix()})"
+
+
+def _meaning(owner: Any) -> str:
+    return plain_marks(read(owner).summary)
+
+
+if __name__ == "__main__":
+    for path in sorted(Path(__file__).parent.rglob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        if (new := written(text)) != text:
+            if "--check" in sys.argv:
+                sys.exit(f"old tables in {path}: make pages")
+            path.write_text(new, encoding="utf-8")
