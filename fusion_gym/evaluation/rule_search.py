@@ -215,7 +215,7 @@ class RuleSearch:
 
 
 def class_of(task: Task, local: bool) -> ClassName:
-    """Return the class of the agents of a task, of which local ones decide by themselves."""
+    """Return the class of the agents of a task; ``local`` ones decide at each sensor."""
     if local:
         return "local"
     return "centre" if task.information == "centre" else "scheduler"
