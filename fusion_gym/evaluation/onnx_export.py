@@ -58,6 +58,8 @@ def export_onnx(
         agent = agent.single_agent()
     if not isinstance(agent, ModelPolicy):
         raise refusal("agent", agent, "a saved agent, zoo:NAME or model:PATH")
+    if agent.normalization is not None:
+        raise refusal("normalize", agent.normalization, "None: the file takes no statistics")
     path, graph = Path(path), DecisionGraph(agent)
     save_graph(graph, path, onnx_card(agent, graph, environment, model))
     result = onnx_agreement(agent, graph, path, task)

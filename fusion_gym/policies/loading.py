@@ -6,12 +6,15 @@ loader of Stable-Baselines3 loads the file and runs code that it contains.
 """
 
 import dataclasses
+import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
 from fusion_gym import validation
 from fusion_gym.core.task import ACTION_KINDS, Task
@@ -35,6 +38,7 @@ def load_model_policy(
     task: Task,
     deterministic: bool = True,
     price: float | None = None,
+    normalize: str | None = None,
     *,
     trust: bool = False,
 ) -> ModelPolicy:
@@ -45,6 +49,8 @@ def load_model_policy(
         task: the task.
         deterministic: take the likeliest action instead of a draw.
         price: price of a token, for an agent that was trained for a range of prices.
+        normalize: file of ``VecNormalize.save``, for an agent that was trained under VecNormalize;
+            a pickle, which needs ``trust``.
         trust: use the loader of Stable-Baselines3, which runs code of the file.
 
     Raises:
@@ -56,6 +62,10 @@ def load_model_policy(
     try:
         data = read_plain(file)
         observed = ModelView.read(data)
+        # On-policy algorithms keep an observation before normalization under VecNormalize alone.
+        normalized = "gae_lambda" in data and data.get("_last_original_obs") is not None
+        if normalize is None and normalized:
+            raise validation.refusal("normalize", None, "the file of its VecNormalize statistics")
         load = _unpickled if trust else _rebuilt
         model, action = load(file, data, observed.on(task), observed)
     except NeedsTrust as error:
@@ -66,7 +76,24 @@ def load_model_policy(
     except ConfigurationError as error:
         raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
     task = dataclasses.replace(task, action=action)
-    return ModelPolicy(model, task, deterministic, price, observed)
+    policy = ModelPolicy(model, task, deterministic, price, observed)
+    if normalize is not None:
+        policy.normalization = _statistics(normalize, policy.view, trust)
+    return policy
+
+
+def _statistics(path: str, view: View, trust: bool) -> VecNormalize:
+    """Return the statistics of VecNormalize, whose file runs any code in it."""
+    if not trust:
+        raise validation.refusal("normalize", path, "given with --trust: it is a pickle")
+    try:
+        statistics = pickle.loads(Path(path).read_bytes())
+    except Exception as error:  # a pickle raises errors of any class
+        raise validation.refusal("normalize", path, f"a readable file ({error})") from None
+    shape = getattr(getattr(statistics, "obs_rms", None), "mean", np.empty(0)).shape
+    if not isinstance(statistics, VecNormalize) or shape != view.space.shape:
+        raise validation.refusal("normalize", path, f"statistics of shape {view.space.shape}")
+    return statistics
 
 
 def model_file(path: str) -> Path:

@@ -8,6 +8,7 @@ import torch
 from gymnasium import spaces
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.observation import ObservationLayout
@@ -62,6 +63,7 @@ class ModelPolicy:
         owner = self.view.owner or "scheduler"
         self._layout = None if same else ObservationLayout(self.task, owner)
         self._memory: Any = None  # of a recurrent policy
+        self.normalization: VecNormalize | None = None  # of the training
         self.stateless = deterministic and not isinstance(model, RecurrentPPO)
         self.knowledge: Knowledge = self.view.knowledge
         self.memory_owner = self.view.owner
@@ -112,7 +114,10 @@ class ModelPolicy:
             own = observation[:, :-1] if self._visible else observation  # the price comes last
             column = np.full((len(own), 1), self.price, dtype=np.float32)
             observation = np.concatenate((own, column), axis=1)
-        return self.view.rows(observation)
+        rows: Any = self.view.rows(observation)
+        if self.normalization is not None:
+            rows = self.normalization.normalize_obs(rows)
+        return rows
 
     def check_logits(self) -> None:
         """Refuse an agent without one logit for each sensor."""

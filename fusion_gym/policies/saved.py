@@ -12,6 +12,7 @@ def saved_agent(
     deterministic: bool = True,
     price: float | None = None,
     calibrated: bool = True,
+    normalize: str | None = None,
     *,
     trust: bool = False,
 ) -> Policy:
@@ -23,6 +24,7 @@ def saved_agent(
         deterministic: take the likeliest action instead of a draw.
         price: price of a token, for an agent that was trained for a range of prices.
         calibrated: use the calibration of the file, if it has one, or the agent alone.
+        normalize: file of the statistics of an agent that was trained under VecNormalize.
         trust: whether the file may run code; a text cannot set it.
 
     Raises:
@@ -36,7 +38,7 @@ def saved_agent(
     try:
         read_part(file, CALIBRATION)
     except ConfigurationError:
-        return load_model_policy(path, task, deterministic, price, trust=trust)
+        return load_model_policy(path, task, deterministic, price, normalize, trust=trust)
     if calibrated and not deterministic:
         raise refusal("deterministic", deterministic, "true for calibrated agents")
     try:
