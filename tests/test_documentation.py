@@ -49,6 +49,35 @@ def test_what_a_page_links_exists(path: Path) -> None:
             assert part in anchors, f"{name}#{part}"
 
 
+QUESTIONS = {
+    "the options of an environment": "docs/tobit_oscillator.md#options",
+    "the entries of an observation": "docs/remote_estimation.md#observation",
+    "the list of rules": "docs/rules.md#rules",
+    "the list of filters": "docs/filters.md#filters",
+    "the metrics": "docs/policies.md#metrics",
+    "losses and delays": "docs/environments.md#losses-and-delays",
+    "whether SAC, TD3 or RecurrentPPO work": "docs/algorithms.md#which-algorithm-works",
+    "VecNormalize": "docs/algorithms.md#vecnormalize",
+    "a plant of one's own": "docs/your_system.md#",
+    "a log of one's own": "docs/tutorials/your_log.md#",
+    "what a learned policy saves": "results/README.md#against-the-searched-rule",
+    "a paper's figures": "docs/reproduction/README.md#",
+}
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_a_question_is_two_clicks_from_the_readme(question: str) -> None:
+    """A click is a link to a page; on the page the question has a heading."""
+    name, _, heading = QUESTIONS[question].partition("#")
+    pages = {ROOT / "README.md"}
+    for _ in range(2):
+        links = ((page, re.findall(r"\]\(([\w/.]+\.md)", page.read_text())) for page in pages)
+        pages = pages | {(page.parent / link).resolve() for page, every in links for link in every}
+    assert ROOT / name in pages
+    heads = re.findall(r"^#+ (.*)$", (ROOT / name).read_text(), re.MULTILINE)
+    assert not heading or heading in [head.lower().replace(" ", "-") for head in heads]
+
+
 def test_configs_that_the_texts_name_exist() -> None:
     configs = re.findall(r"(?:--config|--sweep) (\w+)(?![\w/]|\.yaml)", TEXTS)
     assert configs

@@ -21,9 +21,10 @@ FEW = {
     "episodes=400": "episodes=100",
 }
 PAGES = {
-    "step": "README.md",
-    "evaluate": "README.md",
-    "train": "README.md",
+    "ten_lines": "README.md",
+    "step": "docs/start.md",
+    "evaluate": "docs/start.md",
+    "train": "docs/start.md",
     "pareto_front": "docs/training.md",
     "own_plant": "docs/your_system.md",
     "read_result": "docs/benchmark.md",
