@@ -76,6 +76,8 @@ _PLACES = {
     "training.run": ("train",),
 }
 
+_EXTRAS = {"envs.parallel": "marl", "envs.privileged": "sb3", "envs.sb3": "sb3"}
+
 register()
 
 
@@ -93,7 +95,8 @@ if not TYPE_CHECKING:  # type checkers see only the names above
                 try:
                     return getattr(importlib.import_module(f"{__name__}.{module}"), name)
                 except ModuleNotFoundError as error:
-                    missing = f"{error}: pip install 'fusion-gym[agents]'"
+                    extra = _EXTRAS.get(module, "agents")
+                    missing = f"{error}: install fusion-gym with its extra {extra!r}"
                     raise ModuleNotFoundError(missing, name=error.name) from None
         if name in ("evaluation", "jax", "zoo"):
             return importlib.import_module(f"{__name__}.{name}")
