@@ -23,6 +23,7 @@ from fusion_gym.policies.registry import Kind, policy_maker, policy_names, polic
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.training.algorithms import algorithm_table
 
+_LEGEND = "Only sensors know an entry with a star ([who knows what](concepts.md#who-knows-what))."
 _WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
 
 
@@ -48,7 +49,7 @@ def observation_table(text: str) -> str:
     """
     first, *others = text.split("; ")
     rest = [(f"`{other}`", task_of(f"{first.split()[0]} {other}")) for other in others]
-    return f"{pages.LEGEND}\n\n{pages.observation_table(task_of(first), *rest)}"
+    return f"{_LEGEND}\n\n{pages.observation_table(task_of(first), *rest)}"
 
 
 def option_table(text: str) -> str:
