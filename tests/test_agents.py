@@ -173,7 +173,7 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
     labels = ("Linear fusion, 2 sensors", "Tobit oscillator, 3 sensors")
     assert titles == [f"{label}: the calibrated agent" for label in labels]
     *_, last = filter(str.strip, printed.splitlines())
-    assert last.strip().startswith("the calibrated agent, mean of 7 prices")
+    assert last.strip().startswith("the calibrated agent, mean over prices")
     for name in demo.CONFIGS:
         folder = tmp_path / name
         assert (folder / "comparison" / "pareto.png").stat().st_size > 20_000

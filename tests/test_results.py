@@ -72,7 +72,7 @@ def test_a_rule_is_compared_under_its_name_in_few_curves(
     assert figure.get_suptitle() == f"Tobit oscillator, 3 sensors: {rest}"
     assert "agent" not in " ".join([printed.out, printed.err, *labels])
     *_, last = filter(str.strip, printed.out.splitlines())
-    assert last.split()[:5] == ["innovation_threshold,", "mean", "of", "1", "prices"]
+    assert last.split()[:4] == ["innovation_threshold,", "mean", "over", "prices"]
 
 
 def test_saved_agents_alone_are_called_agents() -> None:

@@ -142,7 +142,8 @@ def compare(
         figures.FigureLine(label, list(results.values())),
     ]
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", class_name(env_id)).capitalize()
-    title = f"{name}, {task.sensors} sensors: {label} against the best rule at the same price"
+    sensors = f"{task.sensors} sensor{'s' * (task.sensors > 1)}"
+    title = f"{name}, {sensors}: {label} against the best rule at the same price"
     figures.pareto(folder / "pareto.png", title, lines, [point.at_price for point in points])
 
 
@@ -208,7 +209,7 @@ def price_table(points: Sequence[Point], baselines: Mapping[str, EpisodeResults]
         costs = f"{cost:.4f}", tables.difference(difference), tables.share(point.at_price.relative)
         rows.append((best, f"{price:.4g}", *rates, *costs))
     mean = tables.share(float(np.mean([point.at_price.relative for point in points])))
-    rows.append((f"{label}, mean of {len(points)} prices", "", "", "", "", "", mean))
+    rows.append((f"{label}, mean over prices", "", "", "", "", "", mean))
     own = f"{label.removeprefix('the ')}'s rate"
     heads = "price", "its rate", own, "its cost", "difference [95 %]", "relative"
     title = f"at equal price: cost = error + price · tokens, a step; negative: {label} is better"

@@ -140,8 +140,7 @@ class Film:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        strips = [_STRIP] * (1 if self.task.bucket.unlimited else 2)
-        ratios = [_STATE] * len(self._state_names) + strips
+        ratios = [_STATE] * len(self._state_names) + [_STRIP] * (2 - self.task.bucket.unlimited)
         height = _TOP + _BOTTOM + sum(ratios)
         self._figure = Figure(figsize=(_WIDTH / 100, height / 100), dpi=100)
         self._canvas = FigureCanvasAgg(self._figure)
