@@ -73,7 +73,7 @@ class Pool:
         try:
             from distributed import Client
         except ImportError:
-            reason = "it needs distributed, which 'fusion-gym[dask]' installs"
+            reason = "it needs distributed: install fusion-gym with its extra 'dask'"
             raise forbidden("backend", "dask", reason) from None
         if self.address is None:
             return Client(n_workers=self.workers, threads_per_worker=1)

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import fusion_gym
-from fusion_gym import linalg
-from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.systems.nonlinear import NonlinearSystem
+from fusion_gym import CommonOptions, NonlinearSystem, Scenario, linalg
 
 STEP, GRAVITY, FRICTION = (
     0.05,

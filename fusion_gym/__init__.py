@@ -15,40 +15,68 @@ from fusion_gym.version import __version__
 
 if TYPE_CHECKING:
     from fusion_gym import evaluation, jax, zoo
+    from fusion_gym.core.options import CommonOptions, Scenario
+    from fusion_gym.core.system import Block, Signal, System, age_block
+    from fusion_gym.core.task import Task
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.privileged import make_sb3_vec_env
     from fusion_gym.envs.sb3 import FusionSB3VecEnv
     from fusion_gym.envs.single import FusionEnv
     from fusion_gym.envs.vector import FusionVectorEnv
+    from fusion_gym.policies.base import Policy, Rule, parameter
+    from fusion_gym.systems.nonlinear import NonlinearSystem
+    from fusion_gym.training.config import Experiment
+    from fusion_gym.training.run import train
 
 __all__ = [
+    "Block",
+    "CommonOptions",
     "ConfigurationError",
+    "Experiment",
     "FusionEnv",
     "FusionParallelEnv",
     "FusionSB3VecEnv",
     "FusionVectorEnv",
+    "NonlinearSystem",
+    "Policy",
+    "Rule",
+    "Scenario",
+    "Signal",
+    "System",
+    "Task",
     "__version__",
+    "age_block",
     "evaluation",
     "jax",
     "make_policy",
     "make_sb3_vec_env",
     "make_task",
     "parallel_env",
+    "parameter",
     "policy_names",
     "register",
     "register_policy",
+    "train",
     "zoo",
 ]
 
-# Interfaces and their modules; most need the extra "agents".
-_INTERFACES = {
-    "FusionEnv": "single",
-    "FusionVectorEnv": "vector",
-    "FusionSB3VecEnv": "sb3",
-    "make_sb3_vec_env": "privileged",
-    "FusionParallelEnv": "parallel",
-    "parallel_env": "parallel",
+# Names that are imported on first access, by module; some need an extra.
+_PLACES = {
+    "core.options": ("CommonOptions", "Scenario"),
+    "core.system": ("Block", "Signal", "System", "age_block"),
+    "core.task": ("Task",),
+    "envs.parallel": ("FusionParallelEnv", "parallel_env"),
+    "envs.privileged": ("make_sb3_vec_env",),
+    "envs.sb3": ("FusionSB3VecEnv",),
+    "envs.single": ("FusionEnv",),
+    "envs.vector": ("FusionVectorEnv",),
+    "policies.base": ("Policy", "Rule", "parameter"),
+    "systems.nonlinear": ("NonlinearSystem",),
+    "training.config": ("Experiment",),
+    "training.run": ("train",),
 }
+
+_EXTRAS = {"envs.parallel": "marl", "envs.privileged": "sb3", "envs.sb3": "sb3"}
 
 register()
 
@@ -61,15 +89,15 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # type checkers see only the names above
 
     def __getattr__(name: str) -> Any:
-        """Import an interface and its optional packages on first access."""
-        if name in _INTERFACES:
-            try:
-                return getattr(
-                    importlib.import_module(f"{__name__}.envs.{_INTERFACES[name]}"), name
-                )
-            except ModuleNotFoundError as error:
-                missing = f"{error}: pip install 'fusion-gym[agents]'"
-                raise ModuleNotFoundError(missing, name=error.name) from None
+        """Import a name and its optional packages on first access."""
+        for module, names in _PLACES.items():
+            if name in names:
+                try:
+                    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+                except ModuleNotFoundError as error:
+                    extra = _EXTRAS.get(module, "agents")
+                    missing = f"{error}: install fusion-gym with its extra {extra!r}"
+                    raise ModuleNotFoundError(missing, name=error.name) from None
         if name in ("evaluation", "jax", "zoo"):
             return importlib.import_module(f"{__name__}.{name}")
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

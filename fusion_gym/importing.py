@@ -66,7 +66,7 @@ def require(user: str, extra: str, *packages: str) -> None:
     for package in packages:
         if importlib.util.find_spec(package) is None:
             absent = f"{user} needs {package}, which is absent"
-            raise ConfigurationError(f"{absent}: pip install 'fusion-gym[{extra}]'")
+            raise ConfigurationError(f"{absent}: install fusion-gym with its extra {extra!r}")
 
 
 def name_of(value: Any) -> str:

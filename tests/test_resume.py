@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import yaml
 from small_runs import meaning
+from stable_baselines3.common.callbacks import BaseCallback
 from training_configs import ENV, read_records, small_config
 
+import fusion_gym
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.training import run
 from fusion_gym.training.checked import load_checked
@@ -241,3 +243,21 @@ def test_a_refused_config_leaves_no_folder(
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_callback_of_ones_own_sees_every_rollout_and_may_end_the_training(tmp_path: Path) -> None:
+    class Log(BaseCallback):
+        rollouts = 0
+
+        def _on_step(self) -> bool:
+            return self.num_timesteps < 512
+
+        def _on_rollout_end(self) -> None:
+            self.rollouts += 1
+
+    log, experiment = Log(), experiment_of(tmp_path / "run", "ppo")
+    summary = fusion_gym.train(experiment, quiet=True, callbacks=[log])
+    assert log.rollouts == 512 // (16 * 8) - 1  # the last rollout is not complete
+    assert (summary["timesteps"], summary["finished"]) == (512, False)
+    summary = fusion_gym.train(experiment, quiet=True, resume=True)
+    assert (summary["timesteps"], summary["finished"]) == (1024, True)

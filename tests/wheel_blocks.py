@@ -79,6 +79,42 @@ for place, folder, (program, name, *words) in json.loads(sys.stdin.read()):
 """
 
 
+_PPO = """
+import fusion_gym
+from stable_baselines3 import PPO
+ENV = "fusion_gym/LinearFusion-v2"
+model = PPO("MlpPolicy", fusion_gym.make_sb3_vec_env(ENV, 2), n_steps=8, batch_size=16).learn(16)
+model.save("agent.zip")
+task = fusion_gym.make_task(ENV, horizon=5)
+agent = fusion_gym.make_policy("model:agent.zip", task)
+fusion_gym.evaluation.run_episodes(task, agent, 2)
+"""
+_COMMANDS = """
+import contextlib, sys
+from fusion_gym.commands.__main__ import main
+for line in ("list", "info innovation_threshold", "info tanks", "fit tanks --output plant.yaml",
+             "evaluate --env fusion_gym/LinearFusion-v2 --policies always --episodes 2"):
+    sys.argv = ["fusion-gym", *line.split()]
+    with contextlib.suppress(SystemExit):
+        main()
+"""
+# What an extra is for, in an environment with that extra alone.
+USES = {
+    "": "import fusion_gym as f; t = f.make_task('fusion_gym/LinearFusion-v2', horizon=5); "
+    "f.evaluation.run_episodes(t, f.make_policy('always', t), 2)",
+    "marl": "import fusion_gym as f; f.parallel_env('fusion_gym/LinearFusion-v2').reset(seed=0)",
+    "sb3": _PPO,
+    "onnx": f"{_PPO}from fusion_gym.evaluation.onnx_export import export_onnx\n"
+    "export_onnx(agent, task, 'agent.onnx', ENV)",
+    "logs": _COMMANDS,
+    "render": "import gymnasium, fusion_gym; e = gymnasium.make('fusion_gym/LinearFusion-v2', "
+    "render_mode='rgb_array'); e.reset(seed=0); e.render()",
+    "jax": "import fusion_gym.jax; fusion_gym.jax.make('fusion_gym/LinearFusion-v2')",
+    "dask": "from distributed import Client",
+    "agents": "import fusion_gym, cmaes, tensorboard; fusion_gym.train, fusion_gym.parallel_env",
+}
+
+
 @dataclass
 class Pages:
     """What was run of the pages, and what was not."""
@@ -105,6 +141,14 @@ class Pages:
             if output is not None:
                 self.failed.append(f"{block.place}: {output}")
             print(f"{taken:5.1f} s  {block.place}{'  failed' if output else ''}", flush=True)
+
+    def use(self, extra: str, folder: Path) -> None:
+        """What an extra is for."""
+        environment = self.wheel.environment(frozenset(filter(None, [extra])))
+        (place := folder / f"use_{extra}").mkdir()
+        words = [str(environment.programs / "python"), "-c", USES[extra]]
+        if (output := _wrong(words, environment, place)) is not None:
+            self.failed.append(f"the extra {extra!r}: {output}")
 
     def _run(self, block: Block, later: Sequence[Block], folder: Path) -> str | None:
         """What is wrong with a block; ``None`` if nothing is."""
@@ -220,6 +264,9 @@ def run_pages(pages: Sequence[Path], wheel: Path | None) -> None:
         folder = Path(place)
         file = wheel or build(copy(folder / "source"), folder / "built")
         run = Pages(Wheel(file, folder), (ROOT / "Makefile").read_text())
+        for extra in run.wheel.extras if not pages else []:
+            if extra not in ("docs", "test"):
+                run.use(extra, folder)
 
         def run_page(number: int, page: Path) -> None:
             own = page.resolve().is_relative_to(ROOT)

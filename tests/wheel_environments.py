@@ -127,7 +127,8 @@ def closure(expected: Iterable[Requirement], extras: Iterable[str]) -> dict[str,
         Absent: one is not installed.
     """
     result: dict[str, Distribution] = {}
-    left = [(item, tuple(extras)) for item in expected]
+    own = [*expected]
+    left = [(item, tuple(extras)) for item in own]
     visited = set()
     while left:
         requirement, selection = left.pop()
@@ -136,9 +137,12 @@ def closure(expected: Iterable[Requirement], extras: Iterable[str]) -> dict[str,
             continue
         name = canonicalize_name(requirement.name)
         key = (name, frozenset(requirement.extras))
-        if key in visited or name == OWN:
+        if key in visited:
             continue
         visited.add(key)
+        if name == OWN:  # an extra that consists of others
+            left += [(item, tuple(requirement.extras)) for item in own]
+            continue
         try:
             result[name] = importlib.metadata.distribution(name)
         except importlib.metadata.PackageNotFoundError:

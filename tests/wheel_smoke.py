@@ -114,7 +114,9 @@ def use(programs: Path, folder: Path) -> None:
     python, program = programs / "python", programs / "fusion-gym"
     call(python, "-c", LIBRARY, cwd=folder)
     lacking = call(python, "-c", WITHOUT_EXTRA, cwd=folder, status=1).stderr
-    assert lacking.strip() == "error: tyro is missing: pip install 'fusion-gym[agents]'", lacking
+    assert (
+        lacking.strip() == "error: tyro is missing: install fusion-gym with its extra 'agents'"
+    ), lacking
     call(python, "-c", HELP, cwd=folder)
     call(
         program, "evaluate", "--config", "tobit_oscillator_ppo", "--set", "belief_features=true",

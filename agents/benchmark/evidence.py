@@ -152,7 +152,7 @@ def find_rules(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> Non
 
 
 def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
-    """Train and calibrate the agents of all classes, and those of the comparison."""
+    """Train and calibrate the agents of all classes, and the other algorithm's."""
     places = []
     for item in classes:
         for kind, (algorithm, steps) in suite.algorithms(item.setting, item.name).items():
@@ -351,7 +351,7 @@ def training_rows(classes: Sequence[Evidence]) -> list[TrainingRow]:
         (reference,) = item.tests[REFERENCE]
         for kind, every in item.trainings.items():
             for seed, (job, result) in enumerate(every):
-                alone, learned = (
+                agent, learned = (
                     mean_difference([([item.tests[name][seed]], reference)]).mean
                     for name in (kind, CALIBRATED[kind])
                 )
@@ -360,7 +360,7 @@ def training_rows(classes: Sequence[Evidence]) -> list[TrainingRow]:
                     TrainingRow(
                         item.setting.name, item.name, kind, job.experiment.algorithm.name, seed,
                         job.experiment.training.timesteps, result.seconds,
-                        result.calibration_seconds, rule_only, alone, learned,
+                        result.calibration_seconds, rule_only, agent, learned,
                     )
                 )  # fmt: skip
     return rows

@@ -129,7 +129,7 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
         table(
             ("setting", "case", "rule", "learned policy"),
             (
-                (titles[r.setting], r.case, percent(r.rule, 0), interval(r, r.difference))
+                (titles[r.setting], r.case, signed_percent(r.rule, 0), interval(r, r.difference))
                 for r in results.cases
             ),
         ),
@@ -146,7 +146,7 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
         write_text(README, re.sub(pattern, lambda _: part, text, flags=re.DOTALL))
 
 
-def percent(value: float, digits: int = 1) -> str:
+def signed_percent(value: float, digits: int = 1) -> str:
     """Return a share in per cent, with its sign."""
     return f"{100.0 * value:+.{digits}f}".replace("-", "−")
 
@@ -154,7 +154,7 @@ def percent(value: float, digits: int = 1) -> str:
 def interval(row: PointRow | ClassRow | SavingRow | CaseRow, value: float) -> str:
     """Return a value in per cent with half the width of its row's interval."""
     half = 50.0 * (row.high - row.low)
-    return percent(value) + (f" ± {half:.1f}" if half > 0.0 else "")
+    return signed_percent(value) + (f" ± {half:.1f}" if half > 0.0 else "")
 
 
 def headline_text(settings: Sequence[Setting], rows: Sequence[SavingRow]) -> str:
@@ -213,7 +213,9 @@ def mean_text(row: ClassRow | None) -> str:
     if row is None:
         return "–"
     moved = abs(row.difference - row.median) >= GAIN
-    return interval(row, row.difference) + (f" (median {percent(row.median)})" if moved else "")
+    return interval(row, row.difference) + (
+        f" (median {signed_percent(row.median)})" if moved else ""
+    )
 
 
 def comparison_table(titles: dict[str, str], results: Results) -> str:
@@ -246,9 +248,9 @@ def sentences(results: Results) -> list[str]:
 
     def mean(kind: str) -> str:
         values = [row.difference for row in rows[kind]]
-        ends = f"{percent(min(values))} to {percent(max(values))}"
-        middle = percent(float(np.median(values)))
-        return f"{percent(float(np.mean(values)))} % (median {middle} %, {ends} %)"
+        ends = f"{signed_percent(min(values))} to {signed_percent(max(values))}"
+        middle = signed_percent(float(np.median(values)))
+        return f"{signed_percent(float(np.mean(values)))} % (median {middle} %, {ends} %)"
 
     def places(sign: int) -> str:
         """Return the classes whose difference exceeds the gain, with a whole interval."""
@@ -363,7 +365,7 @@ def draw_headline(results: Results, titles: dict[str, str], path: Path) -> None:
             arrowprops={"arrowstyle": "->", "color": STYLES["learned"].colour, "linewidth": 0.8},
         )  # fmt: skip
         middle = price, (trigger * learned) ** 0.5
-        saving = f" {percent(learned / trigger - 1.0, 0)} %"
+        saving = f" {signed_percent(learned / trigger - 1.0, 0)} %"
         panel.annotate(saving, middle, va="center", color=STYLES["learned"].colour)
     panel.set(
         xscale="log", yscale="log", xlabel="price of a token", ylabel="error + price · tokens",
@@ -389,6 +391,6 @@ def print_classes(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> None:
         }
         result.add_row(
             row.setting, row.name, row.kind, mean_text(row),
-            *(percent(own[share].difference) if own else "–" for share in shares),
+            *(signed_percent(own[share].difference) if own else "–" for share in shares),
         )  # fmt: skip
     tables.console().print(result)

@@ -51,7 +51,7 @@ class ThresholdRule(Strict):
 class Setting(Strict):
     """An environment with options, its own trigger, and the length of its trainings.
 
-    ``optimum`` is a policy with ``{price}``, ``seconds`` about those of a training in a class.
+    ``optimum`` is a policy with ``{price}``, ``seconds`` about the length of a training in a class.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -94,7 +94,7 @@ class Setting(Strict):
         return _perturbed(options, case)
 
 
-class Comparison(Strict):
+class OtherAlgorithm(Strict):
     """Another algorithm, in one class of some settings, with a factor of each one's time steps."""
 
     algorithm: AnyAlgorithm
@@ -116,7 +116,7 @@ class Suite(Strict):
     training_seeds: tuple[Positive, Positive]
     shares: tuple[Share, ...]
     algorithm: AnyAlgorithm
-    comparison: Comparison
+    comparison: OtherAlgorithm
     steps: Rate = 1.0
     rules: tuple[ThresholdRule, ...]
     cases: tuple[Case, ...]

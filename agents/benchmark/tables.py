@@ -86,7 +86,7 @@ class TrainingRow:
     seconds: float
     calibration_seconds: float
     rule_points: int  # prices at which the calibration takes the rule alone
-    alone: float
+    agent: float
     learned: float
 
 

@@ -19,7 +19,7 @@ from fusion_gym.training.calibration import EPISODES, calibrate
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import holds_training, train
 
-CALIBRATION = 0.3  # seconds of a calibration over those of a training
+CALIBRATION = 0.3  # seconds of a calibration over a training's
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class TrainingJob(Job):
 
     @property
     def weight(self) -> float:  # type: ignore[override]
-        """Return about the seconds on one core, with those of the calibration."""
+        """Return about the seconds on one core, of training and calibration."""
         return (1.0 + CALIBRATION) * self.setting.seconds[self.name]
 
     @property

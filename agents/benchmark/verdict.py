@@ -97,7 +97,7 @@ def mean_difference(
 ) -> Difference:
     """Return the mean relative difference over classes and their prices.
 
-    Each pair has the results of one or more seeds in a class, and those of its reference.
+    Each pair has the results of one or more seeds in a class, and its reference's results.
     """
     blocks = []
     for seeds, reference in pairs:
@@ -111,7 +111,7 @@ def _difference(blocks: Sequence[Array]) -> Difference:
     """Return the mean of blocks (seeds, E) of differences, and its interval.
 
     Seeds and episodes are crossed random factors: the variance of the mean is the variance of the
-    episodes' means over their number plus that of each block's seeds over theirs, with
+    episodes' means over their number plus each block's variance of seeds over their number, with
     Satterthwaite's degrees of freedom.
     """
     episodes = np.mean([block.mean(0) for block in blocks], axis=0)

@@ -8,4 +8,4 @@ def missing_extra(error: BaseException) -> str | None:
     missing = error.name or str(error)
     if missing.partition(".")[0] == "fusion_gym":
         return None
-    return f"error: {missing} is missing: pip install 'fusion-gym[agents]'"
+    return f"error: {missing} is missing: install fusion-gym with its extra 'agents'"

@@ -190,6 +190,13 @@ class Scenario:
         no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
         required_policy: The policy whose silence the filter reads, or ``None``.
         noise: Source of the noise; ``None`` draws standard normals.
+
+    Example:
+        >>> import fusion_gym
+        >>> system = fusion_gym.make_task("fusion_gym/TobitOscillator-v1").system
+        >>> scenario = fusion_gym.Scenario(fusion_gym.CommonOptions(), system, state_weights=[2, 1])
+        >>> scenario.feedback
+        False
     """
 
     options: CommonOptions

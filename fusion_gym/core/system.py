@@ -87,6 +87,11 @@ class Signal:
         axes: Axes of the array, such as ``"(sensors, m, N)"``, the batch axis N last.
         meaning: Short description.
         joint: Whether a sensor's row depends on other sensors, so that the sensor does not know it.
+
+    Example:
+        >>> from fusion_gym import Signal
+        >>> Signal("surprise", "own", "(sensors, N)", "distance to the prediction").knowledge
+        'own'
     """
 
     name: str
@@ -221,7 +226,16 @@ class Block:
 
 
 def age_block(sensors: tuple[str, ...]) -> Block:
-    """Return the block of a state's ``age`` (sensors, N), which every system has."""
+    """Return the block of a state's ``age`` (sensors, N), which every system has.
+
+    Args:
+        sensors: names of the sensors.
+
+    Example:
+        >>> from fusion_gym import age_block
+        >>> age_block(("0", "1")).name
+        'age'
+    """
     meaning = "a/(a + 10), a steps since the last delivery"
     return Block(
         "age", meaning, lambda state: state.age / (state.age + 10.0), (sensors,), node="own"

@@ -66,6 +66,12 @@ class Task:
 
     Raises:
         ConfigurationError: A mode is unknown, the horizon is below 1, or the parts do not fit.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", horizon=50)
+        >>> task.sensors, task.horizon, task.information
+        (3, 50, 'sensors')
     """
 
     system: System[Any]

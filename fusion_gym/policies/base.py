@@ -32,6 +32,13 @@ class Policy(Protocol):
     ``"scheduler"`` or ``"own"``, the owner of the beliefs. A policy that uses only the signals of
     the present step may have a true attribute ``stateless``; simulations may then call it inside an
     episode.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
+        >>> policy: fusion_gym.Policy = fusion_gym.make_policy("always", task)
+        >>> policy.knowledge
+        'clock'
     """
 
     @property
@@ -196,7 +203,22 @@ class LocalRule(Rule):
 
 
 def parameter(default: Any, check: Callable[..., Any], **limits: Any) -> Any:
-    """Return the field of a parameter with its default and ``check(name, value, **limits)``."""
+    """Return the field of a parameter with its default and ``check(name, value, **limits)``.
+
+    Args:
+        default: the default value.
+        check: function that refuses a value, such as a check of :mod:`fusion_gym.validation`.
+        **limits: keywords of the check.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> from fusion_gym import Rule, parameter, validation
+        >>> @dataclass
+        ... class Late(Rule):
+        ...     steps: int = parameter(5, validation.integer, at_least=1)
+        >>> Late().steps
+        5
+    """
     check = functools.partial(check, **limits)
     return dataclasses.field(default=default, metadata={"check": check})
 

@@ -62,6 +62,24 @@ class NonlinearSystem(System[FilteredState]):
 
     Raises:
         ConfigurationError: a wrong shape, or a covariance that is not positive semi-definite.
+
+    Example:
+        >>> from fusion_gym import NonlinearSystem
+        >>> class Still(NonlinearSystem):
+        ...     def move(self, state, noise):
+        ...         return state
+        ...
+        ...     def measure(self, state, noise):
+        ...         return state[None] + 0.1 * noise
+        ...
+        ...     def predict(self, mean, covariance):
+        ...         return mean, covariance
+        ...
+        ...     def update(self, mean, covariance, sensor, measurement):
+        ...         return 0.5 * (mean + measurement), 0.5 * covariance
+        >>> start = {"initial_mean": [0.0], "initial_covariance": [[1.0]]}
+        >>> Still(("x",), sensors=1, process_channels=0, **start).state_names
+        ('x',)
     """
 
     signals = common_signals()

@@ -69,7 +69,32 @@ class CalibrationConfig(Strict):
 
 
 class Experiment(Strict):
-    """One training: environment, algorithm, length, validation, calibration and output folder."""
+    """Declare one training.
+
+    Args:
+        environment: id, options, and whether the policy is local.
+        algorithm: name and settings of the algorithm.
+        training: length, number of runs, seed and threads.
+        validation: steps between validations, and their episodes.
+        calibration: tuning episodes; None for no calibration.
+        output: folder of checkpoints, models and validations.
+
+    Raises:
+        ConfigurationError: an entry that is unknown or not allowed.
+
+    Example:
+        >>> from fusion_gym import Experiment
+        >>> experiment = Experiment.model_validate(
+        ...     {
+        ...         "environment": {"id": "fusion_gym/LinearFusion-v2"},
+        ...         "algorithm": {"name": "ppo"},
+        ...         "training": {"timesteps": 100_000},
+        ...         "output": "runs/ppo",
+        ...     }
+        ... )
+        >>> experiment.algorithm.batch_size, experiment.training.num_envs
+        (4096, 256)
+    """
 
     environment: EnvironmentConfig
     algorithm: AnyAlgorithm

@@ -69,7 +69,13 @@ def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, T
     return make_model(experiment, env), env, task
 
 
-def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
+def train(
+    experiment: Experiment,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    callbacks: Sequence[BaseCallback] = (),
+) -> dict[str, Any]:
     """Run the training and return its summary.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (over
@@ -79,10 +85,25 @@ def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) 
         experiment: the config.
         resume: whether to continue the training in the output folder.
         quiet: whether to print neither progress nor summary.
+        callbacks: callbacks of Stable-Baselines3, which run beside the training's own.
 
     Raises:
         ConfigurationError: a config, environment or folder that does not fit; a config that is not
             allowed leaves no folder.
+
+    Example:
+        >>> import tempfile
+        >>> from fusion_gym import Experiment, train
+        >>> config = {
+        ...     "environment": {"id": "fusion_gym/LinearFusion-v2", "options": {"horizon": 10}},
+        ...     "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 64},
+        ...     "training": {"timesteps": 64, "num_envs": 8},
+        ...     "validation": {"episodes": 2},
+        ... }
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     experiment = Experiment.model_validate(config | {"output": f"{folder}/ppo"})
+        ...     train(experiment, quiet=True)["finished"]
+        True
     """
     folder = Path(experiment.output)
     if resume and not holds_training(folder):
@@ -104,12 +125,12 @@ def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) 
             writing(("checkpoints, models and validations", folder))
         plain = experiment.model_dump(mode="json")
         write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
-        return _learn(experiment, folder, model, env, scored, journal, quiet)
+        return _learn(experiment, folder, model, env, scored, journal, quiet, callbacks)
 
 
 def _learn(
     experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
-    journal: Journal, quiet: bool,
+    journal: Journal, quiet: bool, others: Sequence[BaseCallback],
 ) -> dict[str, Any]:  # fmt: skip
     """Train the remaining steps, write the results and return the summary."""
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
@@ -120,7 +141,7 @@ def _learn(
     ):
         progress = Progress(experiment, folder, scored, interrupt, bar, journal)
         progress.init_callback(model)
-        callbacks: list[BaseCallback] = [Traffic(), progress]
+        callbacks: list[BaseCallback] = [Traffic(), progress, *others]
         if begun < total:
             try:
                 model.learn(total - begun, CallbackList(callbacks), reset_num_timesteps=False)
