@@ -103,7 +103,7 @@ def judge(name: str, arguments: argparse.Namespace) -> Row:
     points = json.loads((folder / "comparison" / "comparison.json").read_text())["points"]
     policies = json.loads((folder / "comparison" / "evaluation.json").read_text())["policies"]
     sustained = sustained_tokens(make_task(ENV, **PLANTS[name]))
-    shares = [policies[point["agent"]]["tokens"]["mean"] / sustained for point in points]
+    shares = [policies[point["policy"]]["tokens"]["mean"] / sustained for point in points]
     costs = [
         point["at_price"]["difference"]["mean"] / point["at_price"]["cost"] for point in points
     ]

@@ -19,6 +19,7 @@ from training_configs import ENV, read_records, small_config
 import fusion_gym
 from fusion_gym.commands import demo
 from fusion_gym.evaluation.metrics import METRICS
+from fusion_gym.output import figures
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run as train
 from fusion_gym.training.algorithms import TABLE
@@ -161,7 +162,18 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
         monkeypatch.setitem(demo.CONFIGS, name, str(tmp_path / f"{name}.yaml"))
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "256"]
+    drawn: list[Any] = []
+    save = figures.save_figure
+    monkeypatch.setattr(figures, "save_figure", lambda f, *to: (drawn.append(f), save(f, *to)))
     printed = succeed("demo", words).out
+    assert [sum(len(axes.containers) for axes in figure.axes) <= 6 for figure in drawn] == [
+        True
+    ] * 2
+    titles = [figure.get_suptitle().partition(" against ")[0] for figure in drawn]
+    labels = ("Linear fusion, 2 sensors", "Tobit oscillator, 3 sensors")
+    assert titles == [f"{label}: the calibrated agent" for label in labels]
+    *_, last = filter(str.strip, printed.splitlines())
+    assert last.strip().startswith("the calibrated agent, mean over prices")
     for name in demo.CONFIGS:
         folder = tmp_path / name
         assert (folder / "comparison" / "pareto.png").stat().st_size > 20_000

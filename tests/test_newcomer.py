@@ -50,7 +50,7 @@ def test_the_lines_of_the_page_lead_to_a_front(
             assert "kitchen" in ended.out
     assert (tmp_path / "runs/rooms/comparison/pareto.png").stat().st_size > 20_000
     points = json.loads((tmp_path / "runs/rooms/comparison/comparison.json").read_text())["points"]
-    prices = [float(point["agent"].partition("price=")[2]) for point in points]
+    prices = [float(point["policy"].partition("price=")[2]) for point in points]
     # The plant of the file belongs to the training, wherever the file has gone.
     content = yaml.safe_load((tmp_path / "runs/rooms/front/config.yaml").read_text())["environment"]
     options = content["options"]

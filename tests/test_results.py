@@ -4,13 +4,15 @@ import copy
 import json
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
-from command_runs import call, refusal
+from command_runs import call, refusal, succeed
 
-from fusion_gym.commands.compare import Point, price_table, rate_table
+from fusion_gym.commands.compare import Point, _label, price_table, rate_table
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import compare_at_price, compare_with_envelope
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.output import figures
 from fusion_gym.policies.registry import make_policy
 
 ENV = "fusion_gym/TobitOscillator-v1"
@@ -50,4 +52,30 @@ def test_no_error_at_all_can_be_compared() -> None:
         compare_with_envelope(results, {"always": results}),
     )
     assert list(rate_table([point]).columns[5].cells) == ["–"]
-    assert list(price_table([point], {"always": results}).columns[6].cells) == ["–"]
+    assert list(price_table([point], {"always": results}).columns[6].cells) == ["–"] * 2
+
+
+def test_a_rule_is_compared_under_its_name_in_few_curves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No word of an agent; a title in words and at most six curves, of the sweep's fourteen."""
+    drawn: list[plt.Figure] = []
+    monkeypatch.setattr(figures, "save_figure", lambda figure, *_: drawn.append(figure))
+    words = ["--config", "tobit_oscillator_ppo", "--sweep", "tobit_oscillator_sweep"]
+    words += ["--policy", "innovation_threshold:threshold=1", "--episodes", "3"]
+    printed = succeed("compare", [*words, "--output", str(tmp_path)])
+    (figure,) = drawn
+    labels = [str(curve.get_label()) for axes in figure.axes for curve in axes.containers]
+    assert 3 <= len(labels) <= 6
+    assert "innovation_threshold" in labels
+    rest = "innovation_threshold against the best rule at the same price"
+    assert figure.get_suptitle() == f"Tobit oscillator, 3 sensors: {rest}"
+    assert "agent" not in " ".join([printed.out, printed.err, *labels])
+    *_, last = filter(str.strip, printed.out.splitlines())
+    assert last.split()[:4] == ["innovation_threshold,", "mean", "over", "prices"]
+
+
+def test_saved_agents_alone_are_called_agents() -> None:
+    assert _label("zoo:tobit_oscillator_centre") == _label("model:a.zip") == "the agent"
+    assert _label("model:runs/calibrated_model.zip,price=1") == "the calibrated agent"
+    assert _label("my_rules:Mine") == "my_rules:Mine"

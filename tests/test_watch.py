@@ -12,6 +12,7 @@ import pytest
 
 import fusion_gym
 from fusion_gym.commands import watch as command
+from fusion_gym.envs.drawing import Film
 from fusion_gym.evaluation.watching import watch
 from fusion_gym.output.films import save_film
 from fusion_gym.policies.registry import make_policy
@@ -42,6 +43,19 @@ def test_a_policy_alone_is_what_the_environment_draws() -> None:
     drawn, watched = env.render(), frames("always")[-1]
     assert drawn.shape == watched.shape
     np.testing.assert_array_equal(drawn[45:], watched[45:])  # below the title
+
+
+def test_a_film_has_axes_for_its_steps_and_panels_for_what_changes() -> None:
+    """No axis beyond the last step, and no panel of unlimited tokens."""
+    task = fusion_gym.make_task(TOBIT)
+    for film, right in ((Film(task, 1, 40), 41), (Film(task, 1), 61)):
+        height = film.frame().shape[0]
+        axis = film._axes[-1]
+        assert axis.get_xlim() == (0, right)
+        assert axis.get_ylabel() == "tokens"
+    unlimited = Film(fusion_gym.make_task(TOBIT, tokens="unlimited"), 1)
+    assert height - unlimited.frame().shape[0] == 70
+    assert unlimited._axes[-1].get_ylabel() == "sensor"
 
 
 def test_both_policies_meet_the_same_noise() -> None:

@@ -5,14 +5,15 @@ r"""Compare one policy with swept baselines: at its price, and at its rate.
         --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
 
 All policies run on the same seeds. An agent that observes the price of a token, or a rule with a
-parameter ``price``, runs at ``--prices`` prices. At each price the table shows the agent and the
-baseline of the least cost, where cost = error + price · tokens. At the agent's rate the table shows
+parameter ``price``, runs at ``--prices`` prices. At each price a table shows the policy and the
+baseline of the least cost, where cost = error + price · tokens. At the policy's rate a table shows
 its MSE and the MSE of the baselines' lower envelope.
 
 The output folder contains ``evaluation.json`` (every policy), ``comparison.json`` (the comparison)
-and ``pareto.png``.
+and ``pareto.png`` (at most five curves, and the costs beside the best baseline's).
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,15 +25,15 @@ from rich.table import Table
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.evaluate import evaluation_report
 from fusion_gym.commands.options import Episodes, OutputFolder, Seed, Whole
+from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
-from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.registration import class_name, make_task
 from fusion_gym.evaluation.envelope import (
     FAR_APART,
     BaselineComparison,
     PriceComparison,
     compare_at_price,
     compare_with_envelope,
-    lower_envelope,
 )
 from fusion_gym.evaluation.episodes import EpisodeResults, run_several
 from fusion_gym.output import figures, tables
@@ -42,7 +43,7 @@ from fusion_gym.policies.registry import make_policy, policy_names, policy_param
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.diagnosis import warn_of_unused_tokens
-from fusion_gym.training.sweeps import Sweep
+from fusion_gym.training.sweeps import Sweep, SweepCurve
 from fusion_gym.validation import refusal
 
 
@@ -112,44 +113,65 @@ def run_all(
 
 def compare(
     env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
-    agents: Mapping[str, float], seed: int, folder: Path,
+    policies: Mapping[str, float], seed: int, folder: Path,
 ) -> None:  # fmt: skip
-    """Run the agent on the baselines' episodes, and write, print and draw the comparison."""
-    episodes = next(iter(baselines.values())).episodes
-    learned = run_all(task, list(agents), episodes, seed, "agent")
+    """Run the policy on the baselines' episodes, and write, print and draw the comparison."""
+    episodes, label = next(iter(baselines.values())).episodes, _label(next(iter(policies)))
+    results = run_all(task, list(policies), episodes, seed, label)
     points = []
-    for name, item in learned.items():
+    for name, item in results.items():
         means = float(item.rate.mean()), float(item.mse.mean())
-        at_price = compare_at_price(item, baselines, agents[name])
+        at_price = compare_at_price(item, baselines, policies[name])
         points.append(Point(name, *means, at_price, compare_with_envelope(item, baselines)))
-    envelope = lower_envelope(baselines)
-    report = evaluation_report(env_id, task, episodes, seed, baselines | learned)
+    report = evaluation_report(env_id, task, episodes, seed, baselines | results)
     write(folder / "evaluation.json", report)
     write(folder / "comparison.json", {"points": [point.plain() for point in points]})
-    best = (point.at_price.best for point in points)
-    visible = dict.fromkeys([*sweep.points, *best, *(point.name for point in envelope), *learned])
+    if label.endswith("agent"):
+        warn_of_unused_tokens(task, float(next(iter(results.values())).tokens.mean()))
+    best = dict.fromkeys(point.at_price.best for point in points)
     console = tables.console()
-    title = f"{env_id}: single policies, the best of all {len(baselines)} baselines, and the agent"
-    reports = {name: report["policies"][name] for name in visible}
+    title = f"{env_id}: single policies, the best of all {len(baselines)} baselines, and {label}"
+    reports = {n: report["policies"][n] for n in dict.fromkeys([*sweep.points, *best, *results])}
     console.print(tables.evaluation_table(title, reports, report["quantiles"], {}))
-    console.print(price_table(points, baselines))
     console.print(rate_table(points))
-    warn_of_unused_tokens(task, float(next(iter(learned.values())).tokens.mean()))
+    console.print(price_table(points, baselines))
+    rules = ", ".join(sorted({_rule(name) for name in best}))
     lines = [
-        figures.FigureLine(curve.label, [baselines[name] for name in rules])
-        for curve in sweep.curves
-        if (rules := curve.policies(task.reward.price))
+        figures.FigureLine(f"the best rule at each price: {rules}", [baselines[n] for n in best]),
+        *other_curves(task.reward.price, sweep, baselines, points),
+        figures.FigureLine(label, list(results.values())),
     ]
-    single = {name: baselines[name] for name in sweep.points}
-    agent = figures.FigureLine(_label(list(agents)), list(learned.values()))
-    figures.pareto(folder / "pareto.png", env_id, lines, single, agent, envelope)
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", class_name(env_id)).capitalize()
+    sensors = f"{task.sensors} sensor{'s' * (task.sensors > 1)}"
+    title = f"{name}, {sensors}: {label} against the best rule at the same price"
+    figures.pareto(folder / "pareto.png", title, lines, [point.at_price for point in points])
+
+
+def other_curves(
+    price: Price, sweep: Sweep, baselines: Mapping[str, EpisodeResults], points: Sequence["Point"]
+) -> list[figures.FigureLine]:
+    """Return the best curve of each rule, for three rules that are the best at no price."""
+    middle = points[len(points) // 2].at_price.price
+
+    def cost(curve: SweepCurve) -> float:
+        items = (baselines[name] for name in curve.policies(price))
+        return min(float((item.error_cost + middle * item.tokens).mean()) for item in items)
+
+    curves: dict[str, SweepCurve] = {}
+    for curve in sorted(sweep.curves, key=cost):
+        curves.setdefault(_rule(curve.policy), curve)
+    best = {_rule(point.at_price.best) for point in points}
+    others = [curve for rule, curve in curves.items() if rule not in best][:3]
+    return [
+        figures.FigureLine(c.label, [baselines[name] for name in c.policies(price)]) for c in others
+    ]
 
 
 @dataclass(frozen=True)
 class Point:
-    """The agent at one price: its rate per sensor and step, its MSE, and both comparisons."""
+    """The policy at one price: its rate per sensor and step, its MSE, and both comparisons."""
 
-    agent: str
+    policy: str
     rate: float
     mse: float
     at_price: PriceComparison
@@ -164,50 +186,49 @@ class Point:
         return result
 
 
-def _label(agents: Sequence[str]) -> str:
-    if len(agents) > 1:
-        return f"the agent, at {len(agents)} prices"
-    return "the agent" if agents[0].startswith("model:") else agents[0]
+def _rule(policy: str) -> str:
+    """Return the name of a rule without its parameters."""
+    name = policy.partition(":")[0]
+    return name if name in policy_names() else policy
+
+
+def _label(policy: str) -> str:
+    """Return what is compared: a saved agent, or a rule by its name."""
+    if _rule(policy) not in policy_names("agent"):
+        return _rule(policy)
+    return "the calibrated agent" if "calibrated" in policy else "the agent"
 
 
 def price_table(points: Sequence[Point], baselines: Mapping[str, EpisodeResults]) -> Table:
-    """Return the table of the agent and the best baseline at each of its prices."""
+    """Return the table of the policy and the best baseline at each of its prices."""
+    label = _label(points[0].policy)
     rows = []
     for point in points:
         price, best, cost, difference = point.at_price
-        row = (
-            best,
-            f"{price:.4g}",
-            f"{baselines[best].rate.mean():.4f}",
-            f"{point.rate:.4f}",
-            f"{cost:.4f}",
-            tables.difference(difference),
-            f"{point.at_price.relative:+.1%}" if cost else "–",
-        )
-        rows.append(row)
-    heads = "price", "its rate", "agent's rate", "its cost", "difference [95 %]", "relative"
-    title = "at equal price: cost = error + price · tokens, a step; negative: the agent is better"
+        rates = f"{baselines[best].rate.mean():.4f}", f"{point.rate:.4f}"
+        costs = f"{cost:.4f}", tables.difference(difference), tables.share(point.at_price.relative)
+        rows.append((best, f"{price:.4g}", *rates, *costs))
+    mean = tables.share(float(np.mean([point.at_price.relative for point in points])))
+    rows.append((f"{label}, mean over prices", "", "", "", "", "", mean))
+    own = f"{label.removeprefix('the ')}'s rate"
+    heads = "price", "its rate", own, "its cost", "difference [95 %]", "relative"
+    title = f"at equal price: cost = error + price · tokens, a step; negative: {label} is better"
     return tables.table_tables(title, ("best baseline", *heads), rows)
 
 
 def rate_table(points: Sequence[Point]) -> Table:
-    """Return the table of the agent and the envelope, at the agent's rate for each price."""
+    """Return the table of the policy and the envelope, at the policy's rate for each price."""
+    label = _label(points[0].policy)
     rows = []
     for point in points:
         comparison = point.at_rate
-        share = comparison.difference.mean / (comparison.envelope or np.nan)
-        row = (
-            "\n".join(comparison.between),
-            f"{point.rate:.4f}",
-            f"{point.mse:.4f}",
-            f"{comparison.envelope:.4f}" + (" *" if comparison.far_apart else ""),
-            tables.difference(comparison.difference),
-            # Without an error, as with a perfect channel, there is no share.
-            "–" if np.isnan(share) else f"{share:+.1%}",
-        )
-        rows.append(row)
-    heads = "rate", "agent's MSE", "envelope's MSE", "difference [95 %]", "relative"
-    title = "at equal rate: the baselines' lower envelope at the agent's own rate"
+        errors = f"{point.mse:.4f}", f"{comparison.envelope:.4f}{' *' * comparison.far_apart}"
+        difference = comparison.difference
+        share = tables.share(difference.mean / (comparison.envelope or np.nan))
+        cells = f"{point.rate:.4f}", *errors, tables.difference(difference), share
+        rows.append(("\n".join(comparison.between), *cells))
+    heads = "rate", "its MSE", "envelope's MSE", "difference [95 %]", "relative"
+    title = f"at equal rate: {label}, and the baselines' lower envelope at the same rate"
     far = any(point.at_rate.far_apart for point in points)
     note = f"* between baselines whose rates differ by more than {FAR_APART:g} times"
     return tables.table_tables(title, ("envelope between", *heads), rows, note if far else None)

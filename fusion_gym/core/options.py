@@ -131,11 +131,11 @@ class CommonOptions:
     which ``help`` shows. Explicit weights also weigh the trace that covariance intersection
     minimises, which is plain by default."""
     reward_scale: float | Literal["auto"] | None = "auto"
-    """Factor of the state weights. ``"auto"`` simulates a moderate policy and takes the factor with
-    which its error costs 1 per step; explicit ``state_weights`` are not scaled. That policy
-    requests at an even pace: half of the sustained rate, or a quarter of all packets with unlimited
-    tokens. Its errors also scale the entries of ``belief_features``. ``None`` uses the error
-    without transmissions."""
+    """Factor of the state weights. ``"auto"`` simulates requests at an even pace and takes the
+    factor with which their error costs 1 per step; explicit ``state_weights`` are not scaled. The
+    pace is half of the sustained rate, or a quarter of all packets with unlimited tokens. These
+    errors also scale the entries of ``belief_features``. ``None`` uses the error without
+    transmissions."""
     true_process_noise: ArrayLike = 1.0
     """Factor of the true standard deviation of the process noise. The filters assume 1. A pair
     (low, high) is a range from which each episode draws."""

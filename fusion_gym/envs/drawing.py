@@ -15,7 +15,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.importing import require
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
-WINDOW = 60  # steps in a picture
+WINDOW = 60  # steps in a picture, at most
 _MOST_STATES = 4
 # Okabe and Ito's palette for colour-blind readers.
 _TRUTH, _ESTIMATE, _GRANTED, _DENIED, _TOKENS = "black", "#D55E00", "#0072B2", "0.55", "#009E73"
@@ -35,21 +35,23 @@ class Film:
     """The last steps of N runs of a task, and a picture of each run.
 
     A picture shows up to four states with the fused estimate and two claimed standard deviations,
-    one row of requests per sensor (granted or denied), and the tokens. The censored range of a
-    state is shaded.
+    one row of requests per sensor (granted or denied), and the tokens if they are limited. The
+    censored range of a state is shaded.
 
     Args:
         task: The task.
         runs: Number N of runs.
+        steps: Number of steps of the film; the horizon by default.
 
     Raises:
         ConfigurationError: matplotlib is absent.
     """
 
-    def __init__(self, task: Task, runs: int) -> None:
+    def __init__(self, task: Task, runs: int, steps: int | None = None) -> None:
         require("render_mode", "render", "matplotlib")
         self.task = task
-        self._steps: deque[_Step] = deque(maxlen=WINDOW)
+        self._window = min(task.horizon if steps is None else steps, WINDOW)
+        self._steps: deque[_Step] = deque(maxlen=self._window)
         self._ages = np.zeros(runs, dtype=np.int64)  # steps of each run's episode
         self._state_names = task.system.state_names[:_MOST_STATES]
         self._figure: Any = None  # created by the first frame
@@ -83,7 +85,7 @@ class Film:
             self._draw_frame()
         age, steps = int(self._ages[run]), self._recent_steps(run)
         times = np.arange(age - len(steps) + 1, age + 1)
-        first = max(age - WINDOW, 0)
+        first = max(age - self._window, 0)
         self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
         self._draw_states(times, steps, run, self.limits(run) if limits is None else limits)
         granted: list[tuple[int, int]] = []
@@ -94,15 +96,16 @@ class Film:
                 answer.append((int(time), int(sensor)))
         for mark, points in zip(self._marks, (granted, denied), strict=True):
             mark.set_data(*(np.array(points).T if points else ([], [])))
-        self._level.set_data(times, [step.tokens[run] for step in steps])
-        self._axes[-1].set_xlim(first, first + WINDOW + 1)
+        if self._level is not None:
+            self._level.set_data(times, [step.tokens[run] for step in steps])
+        self._axes[-1].set_xlim(first, first + self._window + 1)
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _recent_steps(self, run: int) -> list[_Step]:
         """Return the recorded steps of this run's episode in the window."""
         age = int(self._ages[run])
-        return list(self._steps)[-min(age, WINDOW) :] if age else []
+        return list(self._steps)[-min(age, self._window) :] if age else []
 
     def _series(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
         """Return truth, fused estimate and two claimed deviations, each (steps, shown)."""
@@ -137,10 +140,10 @@ class Film:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        height = _TOP + _BOTTOM + _STATE * len(self._state_names) + 2 * _STRIP
+        ratios = [_STATE] * len(self._state_names) + [_STRIP] * (2 - self.task.bucket.unlimited)
+        height = _TOP + _BOTTOM + sum(ratios)
         self._figure = Figure(figsize=(_WIDTH / 100, height / 100), dpi=100)
         self._canvas = FigureCanvasAgg(self._figure)
-        ratios = [_STATE] * len(self._state_names) + [_STRIP, _STRIP]
         self._axes: list[Any] = list(
             self._figure.subplots(
                 len(ratios), 1, sharex=True,
@@ -165,18 +168,19 @@ class Film:
             axis.set_ylabel(name)
             self._curves.append([truth, mean, band])
         sensors, bucket = self.task.sensors, self.task.bucket
-        requests, level = self._axes[-2:]
+        requests = self._axes[len(self._state_names)]
         (granted,) = requests.plot([], [], "|", color=_GRANTED, ms=9, mew=2, label="granted")
         (denied,) = requests.plot([], [], "x", color=_DENIED, ms=5, label="denied")
         self._marks = (granted, denied)
         requests.set_ylim(sensors - 0.4, -0.6)
         requests.set_yticks(range(sensors) if sensors <= 6 else [0, sensors - 1])
         requests.set_ylabel("sensor")
-        (self._level,) = level.plot([], [], color=_TOKENS, lw=1.6)
-        top = float(bucket.capacity) if np.isfinite(bucket.capacity) else 1.0
-        level.set_ylim(0.0, 1.08 * top)
-        level.set_ylabel("tokens")
-        level.set_xlabel("step")
+        self._level: Any = None
+        if not bucket.unlimited:
+            (self._level,) = self._axes[-1].plot([], [], color=_TOKENS, lw=1.6)
+            self._axes[-1].set(ylim=(0.0, 1.08 * bucket.capacity), ylabel="tokens")
+        self._axes[-1].set_xlabel("step")
+        self._axes[-1].xaxis.get_major_locator().set_params(integer=True)
         for axis in self._axes:
             axis.tick_params(labelsize=8)
             axis.yaxis.set_label_coords(-0.065, 0.5)  # a fixed position is faster

@@ -162,8 +162,8 @@ class PriceComparison(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """The difference as a share of the baseline's cost."""
-        return self.difference.mean / self.cost
+        """The difference as a share of the baseline's cost; NaN if that is zero."""
+        return self.difference.mean / (self.cost or np.nan)
 
 
 def compare_at_price(

@@ -79,7 +79,7 @@ def watch(
     watched = []
     for name, policy in policies.items():
         batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
-        film = Film(task, 1)
+        film = Film(task, 1, steps)
         film.begin()
         watched.append(_Watched(name, batch, film, decide(policy, batch, seed)))
     return _frames(watched, task.horizon if steps is None else steps)

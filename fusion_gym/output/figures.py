@@ -1,17 +1,17 @@
-"""Figures of results: the Pareto front."""
+"""Figures of results: the Pareto front and the costs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fusion_gym.evaluation.envelope import EnvelopePoint
+from fusion_gym.evaluation.envelope import PriceComparison
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.output.files import replacing
-from fusion_gym.output.palette import AGENT, INK
+from fusion_gym.output.palette import AGENT, BLUE, GREEN, PURPLE, SKY
 
 
 class FigureLine(NamedTuple):
@@ -22,39 +22,31 @@ class FigureLine(NamedTuple):
 
 
 def pareto(
-    path: Path,
-    title: str,
-    lines: Sequence[FigureLine],
-    points: Mapping[str, EpisodeResults],
-    agent: FigureLine,
-    envelope: Sequence[EnvelopePoint],
+    path: Path, title: str, lines: Sequence[FigureLine], costs: Sequence[PriceComparison]
 ) -> None:
-    """Draw MSE against transmission rate, with 95 % intervals over episodes."""
-    figure, axes = plt.subplots(figsize=(8.6, 5.6))
-    colours = plt.get_cmap("tab20")
-    for place, line in enumerate(lines):
-        _draw(axes, line.label, line.results, colours(place % 20), marker="o")
-    for place, (name, value) in enumerate(points.items()):
-        _draw(axes, name, [value], INK, marker="sD^vPX"[place % 6], size=4.5)
-    hull = [*envelope]
-    right = axes.get_xlim()[1]
-    known = [point.rate for point in hull]
-    rates = np.union1d(known, np.linspace(known[0], max(right, known[-1]), 400))
-    errors = np.interp(rates, known, [point.mse for point in hull])  # of mixtures
-    axes.plot(rates, errors, "--", color=INK, lw=1, label="lower envelope of the baselines")
-    size = 15.0 if len(agent.results) == 1 else 9.0
-    _draw(axes, agent.label, agent.results, AGENT, marker="*", size=size)
-    axes.set_xlabel("transmissions per sensor and step")
-    axes.set_ylabel("mean squared error of the fused estimate")
-    every = [r for line in lines for r in line.results] + [*points.values(), *agent.results]
-    means = np.array([r.mse.mean() for r in every])
+    """Draw MSE against transmission rate, and the last line's cost beside the best baseline's.
+
+    Bars are 95 % intervals over episodes.
+    """
+    figure, (front, beside) = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
+    colours = [BLUE, SKY, GREEN, PURPLE][: len(lines) - 1]
+    for line, colour in zip(lines, [*colours, AGENT], strict=True):
+        _draw(front, line, colour)
+    front.set(xlabel="transmissions per sensor and step", ylabel="mean squared error")
+    means = np.array([result.mse.mean() for line in lines for result in line.results])
     if means.max() > 6 * means.min():
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(_plain_tick)
-        axes.yaxis.set_minor_formatter(_plain_tick)
-    axes.set_xlim(left=-0.005)
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+        front.set_yscale("log")
+        front.yaxis.set(major_formatter=_plain_tick, minor_formatter=_plain_tick)
+    front.set_xlim(left=-0.005)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+    front.legend(fontsize=8, loc="upper right")
+    mean, low, high = np.array([c.difference for c in costs]).T / [c.cost or np.nan for c in costs]
+    spread, places = 100.0 * np.abs([mean - low, high - mean]), np.arange(len(costs))
+    beside.axhline(0.0, color=BLUE, lw=1.6)
+    beside.errorbar(places, 100.0 * mean, yerr=spread, color=AGENT, marker="o", ms=5, capsize=3)
+    beside.set_xticks(places, [f"{c.price:.3g}" for c in costs])
+    below = f"price of a token; below 0: {lines[-1].label} is cheaper"
+    beside.set(xlabel=below, ylabel="cost above the best rule's at this price [%]")
     save_figure(figure, path)
 
 
@@ -64,21 +56,13 @@ def _plain_tick(value: float, place: float | None = None) -> str:
     return text if f"{value:.0e}"[0] in "1235" else ""
 
 
-def _draw(
-    axes: plt.Axes,
-    label: str | None,
-    results: Sequence[EpisodeResults],
-    colour: object,
-    marker: str,
-    size: float = 3.5,
-) -> None:
-    rate = np.array([r.rate.mean() for r in results])
+def _draw(axes: plt.Axes, line: FigureLine, colour: str) -> None:
+    rate = np.array([result.rate.mean() for result in line.results])
     order = np.argsort(rate, kind="stable")
-    mean, low, high = np.array([mean_interval(results[i].mse) for i in order]).T
-    spread = np.abs([mean - low, high - mean])
+    mean, low, high = np.array([mean_interval(line.results[i].mse) for i in order]).T
     axes.errorbar(
-        rate[order], mean, yerr=spread, label=label, color=colour, marker=marker,
-        ms=size, lw=1.1, elinewidth=0.8, capsize=1.5, zorder=3 if size > 5 else 2,
+        rate[order], mean, yerr=np.abs([mean - low, high - mean]), label=line.label, color=colour,
+        marker="o", ms=3.5, lw=1.1, elinewidth=0.8, capsize=1.5,
     )  # fmt: skip
 
 

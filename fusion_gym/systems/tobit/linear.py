@@ -75,8 +75,9 @@ class LinearFusionOptions(FeedbackOptions):
     The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration. One
     sensor measures its position in metres, one its velocity in metres a second.
 
-    v2: ``reward_scale`` multiplies the state weights: a moderate policy costs 1 a step by default.
-    Its errors scale the entries of beliefs, and the price of a token is 0.5.
+    v2: ``reward_scale`` multiplies the state weights: by default requests at an even pace have
+    errors that cost 1 a step. These errors scale the entries of beliefs. The price of a token is
+    0.5.
 
     Example:
         >>> import fusion_gym
