@@ -148,7 +148,7 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
 
 def signed_percent(value: float, digits: int = 1) -> str:
     """Return a share in per cent, with its sign."""
-    return f"{100.0 * value:+.{digits}f}".replace("-", "−")
+    return f"{round(100.0 * value, digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
 def interval(row: PointRow | ClassRow | SavingRow | CaseRow, value: float) -> str:
@@ -203,7 +203,7 @@ def class_table(titles: dict[str, str], results: Results) -> str:
         lines.append((titles[place[0]], TITLES[place[1]], *cells, limit, rule))
     heads = (
         *("setting", "class", "learned policy", "agents alone", "one tuned threshold"),
-        *("own trigger", "optimum or bound", "points with the rule alone"),
+        *("own trigger", "optimum or bound", "points with the rule alone (μ = 1)"),
     )
     return table(heads, lines)
 

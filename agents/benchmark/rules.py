@@ -49,7 +49,7 @@ class SweepJob(Job):
     rules: tuple[ThresholdRule, ...]
     shares: tuple[float, ...]
     episodes: tuple[int, int]
-    weight: ClassVar[float] = 40.0
+    weight: ClassVar[float] = 25.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class SearchJob(Job):
     generations: int
     folder: Path = field(metadata={"key": False})
     seed: int = 1_000_000_000
-    weight: ClassVar[float] = 120.0
+    weight: ClassVar[float] = 110.0
 
 
 def run_sweep(job: SweepJob) -> SweepResult:

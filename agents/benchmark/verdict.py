@@ -38,7 +38,7 @@ class TestJob(Job):
     content: str
     agent: bool = False
     case: Case | None = None
-    weight: ClassVar[float] = 20.0
+    weight: ClassVar[float] = 8.0
 
     def task(self) -> Task:
         """Return the task of the test."""
