@@ -43,7 +43,7 @@ from fusion_gym.output.files import write_text
 from fusion_gym.output.palette import READABLE
 from fusion_gym.version import __version__
 
-HEADLINE = "tobit_oscillator", "scheduler"  # the class of README's figure
+HEADLINE = "biased_oscillator", "local"  # the class of README's figure
 GAIN = 0.01  # a difference that the sentences name, and between a mean and a median
 README = Path("README.md")
 TITLES = {"centre": "fusion centre", "local": "local sensors", "scheduler": "centralised scheduler"}
