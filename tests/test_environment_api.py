@@ -61,7 +61,9 @@ def test_a_interface_without_its_package_says_what_to_install(
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'fusion-gym\[agents\]'$"):
+    with pytest.raises(
+        ModuleNotFoundError, match=r"install fusion-gym with its extra '(sb3|marl)'$"
+    ):
         getattr(fusion_gym, interface)
 
 

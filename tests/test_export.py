@@ -321,7 +321,7 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == absent else find(name)
     )
-    with pytest.raises(ConfigurationError, match=r"onnxruntime, .*'fusion-gym\[onnx\]'"):
+    with pytest.raises(ConfigurationError, match=r"onnxruntime, .* its extra 'onnx'"):
         command("zoo:tobit_oscillator_centre", tmp_path / "agent.onnx")
 
 

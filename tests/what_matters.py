@@ -167,7 +167,7 @@ def other_runs(values: Values, rng: np.random.Generator) -> Values:
             rolled = ~rolled
         elif rolled.dtype.kind == "f":
             rolled = rolled + rng.standard_normal(rolled.shape).astype(rolled.dtype)
-        result[name] = rolled
+        result[name] = np.abs(rolled) if name == "price" else rolled
     return result
 
 

@@ -9,6 +9,7 @@ several agents the best one is taken at each price. The file is a policy:
 ``model:calibrated.zip,price=0.1``.
 """
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -23,6 +24,7 @@ from fusion_gym.commands.options import OutputFile, Whole
 from fusion_gym.commands.search import token_prices
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output import tables
+from fusion_gym.policies.calibrated import agent_files
 from fusion_gym.policies.loading import model_file
 from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate
 from fusion_gym.training.environment import environment_of
@@ -52,10 +54,12 @@ class Calibrate(EnvironmentOptions, Long):
         task = make_task(env_id, **options)
         if task.reward.price.span is None:
             raise refusal("price_range", None, "the range of prices that the agents observe")
-        files = [agent_file(name) for name in dict.fromkeys(chain(*self.policy))]
+        named = [agent_file(name) for name in dict.fromkeys(chain(*self.policy))]
         prices = token_prices(env_id, options, task, self.prices)
         episodes = EPISODES[0], self.episodes
-        rows = calibrate(task, files, prices, episodes, self.output, self.rule)
+        with tempfile.TemporaryDirectory() as folder:
+            files = [file for path in named for file in agent_files(path, Path(folder))]
+            rows = calibrate(task, files, prices, episodes, self.output, self.rule)
         tables.console().print(calibration_table(env_id, rows))
         print(f"model:{self.output}")
 

@@ -128,7 +128,7 @@ class CalibratedPolicy:
     def at(self, price: Array) -> Mixing:
         """Return agent, μ and c (N,) at prices (N,)."""
         prices, agents, mixtures, thresholds = np.array(self.points).T
-        place, places = np.log(price), np.log(prices)
+        place, places = np.log(np.clip(price, prices[0], prices[-1])), np.log(prices)
         nearest = np.abs(place - places[:, None]).argmin(0)
         mixture, threshold = (np.interp(place, places, part) for part in (mixtures, thresholds))
         return agents.astype(np.int64)[nearest], mixture, threshold
@@ -169,6 +169,19 @@ def save_calibrated(
             archive.writestr(zipfile.ZipInfo(name), part, zipfile.ZIP_DEFLATED)
 
 
+def agent_files(path: Path, folder: Path) -> list[Path]:
+    """Return the files of a policy's agents: its own, or the calibrated agents in a folder."""
+    try:
+        content = json.loads(read_part(path, CALIBRATION))
+    except ConfigurationError:
+        return [path]
+    place = Path(tempfile.mkdtemp(dir=folder))
+    files = [place / f"agent_{number}.zip" for number in range(len(content["slopes"]))]
+    for file in files:
+        file.write_bytes(read_part(path, file.name))
+    return files
+
+
 def load_calibrated(path: Path, task: Task, price: float | None, trust: bool) -> CalibratedPolicy:
     """Return the calibrated policy of a file, whose agents are read as :mod:`loading` reads them.
 
@@ -189,8 +202,6 @@ def load_calibrated(path: Path, task: Task, price: float | None, trust: bool) ->
         raise ConfigurationError(f"its calibration cannot be read: {error}") from None
     rule.price = rule.price if price is None else price
     with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / f"agent_{number}.zip" for number in range(len(slopes))]
-        for file in files:
-            file.write_bytes(read_part(path, file.name))
-        agents = [load_model_policy(str(file), task, True, price, trust=trust) for file in files]
+        files = map(str, agent_files(path, Path(folder)))
+        agents = [load_model_policy(file, task, True, price, trust=trust) for file in files]
     return CalibratedPolicy(task, agents, slopes, rule, points, price)
