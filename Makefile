@@ -106,13 +106,13 @@ integrations-rejax: .venv-rejax/.installed  ## rejax
 integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
 
-benchmark: $(STAMP)  ## rules and agents of every class: results/
+benchmark: $(STAMP)  ## triggers, rules and learned policies of every class, 110 minutes: results/
 	$(BIN)/python -m agents.benchmark
 
 papers: $(STAMP)  ## the five papers' figures, tables and claims: docs/reproduction/
 	$(BIN)/python -m agents.papers all --resume
 
-zoo: $(STAMP)  ## the benchmark's best agents: fusion_gym/zoo/
+zoo: $(STAMP)  ## the best learned policies of the benchmark: fusion_gym/zoo/
 	$(BIN)/python -m agents.zoo
 
 newcomer: $(STAMP)  ## run the commands of docs/newcomer.md and write its tables, 6 minutes

@@ -275,8 +275,8 @@ def sentences(results: Results) -> list[str]:
         f"{mean('agent')} for agents alone.",
         f"Learned policies are cheaper at {fewer} of {len(points)} points and dearer at {more}, "
         "with a false discovery rate of 5 %.",
-        f"They gain at least {GAIN:.0%}, with a whole interval, in: {places(-1)}.",
-        f"They lose at least {GAIN:.0%}, with a whole interval, in: {places(1)}.",
+        f"They gain at least {100 * GAIN:.0f} %, with a whole interval, in: {places(-1)}.",
+        f"They lose at least {100 * GAIN:.0f} %, with a whole interval, in: {places(1)}.",
         f"Trainings of one class differ by at most 2 points in {near} of {len(costs)} classes.",
     ]
 

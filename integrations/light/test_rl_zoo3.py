@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -86,3 +87,18 @@ def test_options_of_the_command_line_come_first(
     output = capsys.readouterr().out
     assert "Episode length: 7.00 +/- 0.00" in output
     assert float(re.findall(r"ep_len_mean\s+\|\s+(\S+)", output)[-1]) == 7.0
+
+
+def test_the_command_of_the_page_on_training_tunes(tmp_path: Path) -> None:
+    """With one short trial of fewer runs."""
+    page = (ROOT / "docs" / "training.md").read_text()
+    (line,) = re.findall(r"^```\n(python -m rl_zoo3.*?)^```", page, re.DOTALL | re.MULTILINE)
+    words = shlex.split(line.replace("\\\n", " "))
+    assert words[: len(command("rl-zoo3"))] == command("rl-zoo3")
+    short = ["-n", "64", "--n-trials", "1", "--hyperparams", "n_envs:2", "-f", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, *words[1:], *short, "--seed", "0"],
+        cwd=ROOT, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    assert "Number of finished trials:  1" in done.stdout
