@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_runs import succeed
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from training_configs import small_config
@@ -181,6 +182,18 @@ def test_without_its_calibration_a_file_is_the_agent(tmp_path: Path) -> None:
     content = output.read_bytes()
     save_calibrated(text, [0.3, 0.3], [point], [file, file], output)
     assert output.read_bytes() == content
+
+
+def test_an_evaluation_draws_no_actions_of_a_calibrated_policy(tmp_path: Path) -> None:
+    task, agent, _ = made()
+    text, output = RULE.format(own="false", margin=1.7), tmp_path / "policy.zip"
+    point = CalibrationPoint(0.3, 0, 0.5, 0.0)
+    save_calibrated(text, [0.3], [point], [saved(agent, tmp_path)], output)
+    options = [f"{name}={value}" for name, value in OPTIONS.items() if value is not None]
+    words = ["--env", LINEAR, "--set", *(word.replace(" ", "") for word in options)]
+    words += ["reward_scale=null", "--episodes", "3", "--policies", f"model:{output}"]
+    succeed("evaluate", [*words, "--json", str(tmp_path / "evaluation.json")])
+    assert requests(task, make_policy(f"model:{output}", task)).episodes == 30
 
 
 POINT = {"price": 0.3, "agent": 0, "mixture": 0.0, "threshold": 0.0}

@@ -78,7 +78,7 @@ class CalibratedPolicy:
     rule: PricedThreshold
     points: Sequence[CalibrationPoint]
     price: float | None = None
-    deterministic, stateless = True, True
+    stateless = True
 
     def __post_init__(self) -> None:
         for agent in self.agents:
