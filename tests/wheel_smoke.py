@@ -25,7 +25,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 CONSTRAINTS = str(ROOT / "constraints.txt")
-HIDDEN = {".ci", ".github", ".readthedocs.yaml", ".gitignore", ".pre-commit-config.yaml"}  # of the repository alone
+# Of the repository alone.
+HIDDEN = {".ci", ".github", ".gitignore", ".pre-commit-config.yaml", ".readthedocs.yaml"}
 LIBRARY = """
 import sys
 import gymnasium as gym
