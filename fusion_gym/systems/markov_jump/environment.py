@@ -91,7 +91,7 @@ class MarkovJumpTrackingOptions(PaperOptions):
         ((1.0, 0.6), (1.0, 0.2)),
         ((0.5, 1.0), (2.0, 0.5)),
     )
-    """H of each sensor and mode, equation (2), (sensors, modes, n): measurements are scalar."""
+    """H of the scalar measurement of each sensor and mode, equation (2), (sensors, modes, n)."""
     sampling_periods: ArrayLike = (1, 2, 3)
     """Steps n_i between two samples of each sensor, whole numbers."""
     fading_values: ArrayLike = ((0.25, 0.5, 1.0), (0.2, 0.4, 0.8), (0.3, 0.6, 0.9))
