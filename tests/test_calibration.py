@@ -20,6 +20,7 @@ from fusion_gym.evaluation.policy_batch import run_priced
 from fusion_gym.policies.calibrated import (
     CalibratedPolicy,
     CalibrationPoint,
+    agent_files,
     save_calibrated,
 )
 from fusion_gym.policies.card import ModelView
@@ -179,6 +180,9 @@ def test_without_its_calibration_a_file_is_the_agent(tmp_path: Path) -> None:
     save_calibrated(text, [0.3, 0.3], [point], [file, file], output)
     with pytest.raises(ConfigurationError, match="price = None is not allowed"):
         make_policy(f"model:{output},calibrated=false", task)
+    files = agent_files(output, tmp_path)
+    assert [path.read_bytes() for path in files] == [file.read_bytes()] * 2
+    assert agent_files(file, tmp_path) == [file]
     content = output.read_bytes()
     save_calibrated(text, [0.3, 0.3], [point], [file, file], output)
     assert output.read_bytes() == content
@@ -197,6 +201,14 @@ def test_an_evaluation_draws_no_actions_of_a_calibrated_policy(tmp_path: Path) -
 
 
 POINT = {"price": 0.3, "agent": 0, "mixture": 0.0, "threshold": 0.0}
+
+
+@pytest.mark.parametrize("content", ["[1]", "{}", '{"slopes": 1}', "no JSON"])
+def test_agents_of_a_file_with_other_content_are_refused(tmp_path: Path, content: str) -> None:
+    with zipfile.ZipFile(tmp_path / "policy.zip", "w") as archive:
+        archive.writestr("calibration.json", content)
+    with pytest.raises(ConfigurationError, match="its calibration cannot be read"):
+        agent_files(tmp_path / "policy.zip", tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -172,11 +172,15 @@ def save_calibrated(
 def agent_files(path: Path, folder: Path) -> list[Path]:
     """Return the files of a policy's agents: its own, or the calibrated agents in a folder."""
     try:
-        content = json.loads(read_part(path, CALIBRATION))
+        content = read_part(path, CALIBRATION)
     except ConfigurationError:
         return [path]
+    try:
+        count = len(json.loads(content)["slopes"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise ConfigurationError(f"its calibration cannot be read: {error}") from None
     place = Path(tempfile.mkdtemp(dir=folder))
-    files = [place / f"agent_{number}.zip" for number in range(len(content["slopes"]))]
+    files = [place / f"agent_{number}.zip" for number in range(count)]
     for file in files:
         file.write_bytes(read_part(path, file.name))
     return files
