@@ -7,17 +7,36 @@ differ by, relative to the sum of magnitudes.
 """
 
 import json
+import warnings
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cases import CASES, Array, Case, read, requests
+from cases import CASES, IDS, SCARCE, VARIANTS, Array, Case, Options, read, requests, short
 
 from fusion_gym.core.memory import Owner
+from fusion_gym.errors import ConfigurationError
 
 FILE = Path(__file__).with_name("recorded_figures.json")
 RUNS, STEPS, TOLERANCE = 3, 8, 1e-6
+SETS, SHARE = 20, 0.35  # drawn sets of options of each environment, and of the options in a set
+# Values of the options that every environment has.
+DRAWN = {
+    "access": ("any", "single", "round_robin", "random"),
+    "belief_features": (True, "value"),
+    "broadcast": ("estimate", "packets"),
+    "clock": (True,),
+    "cost_weight": (0.01, 2.0),
+    "error": ("trace", "maximum"),
+    "information": ("centre",),
+    "memory": (True,),
+    "packet": ("estimate",),
+    "sharing": ("equal", "fixed", "turns"),
+    "tokens": ("limited", "unlimited"),
+    "true_measurement_noise": (2.0, (0.5, 1.5)),
+    "true_process_noise": (0.5, (0.5, 1.5)),
+}
 Figures = dict[str, tuple[float, float]]
 
 
@@ -57,14 +76,46 @@ def owners(case: Case) -> list[Owner | None]:
     return ["scheduler", "own"] if case.local else ["scheduler"]
 
 
-SHIPPED = [case for case in CASES if case.env_id.startswith("fusion_gym/")]
-EVERY = [(case, owner) for case in SHIPPED for owner in owners(case)]
-RECORDED = json.loads(FILE.read_text()) if FILE.exists() else {}
+def drawn_options(env_id: str) -> list[Options]:
+    """Sets of options that the environment allows, drawn with a seed."""
+    rng, result = np.random.default_rng(zlib.crc32(env_id.encode())), []
+    variants = [{}, *VARIANTS.get(short(env_id), []), SCARCE]
+    while len(result) < SETS:
+        options = dict(variants[rng.integers(len(variants))])
+        for name, values in DRAWN.items():
+            if rng.random() < SHARE:
+                options[name] = values[rng.integers(len(values))]
+        try:
+            Case(env_id, options).task()
+        except ConfigurationError:
+            continue
+        result.append(options)
+    return result
 
 
-@pytest.mark.parametrize(("case", "owner"), EVERY, ids=lambda item: str(item))
-def test_figures_are_the_recorded_ones(case: Case, owner: Owner | None) -> None:
-    recorded, figures = RECORDED[f"{case} {owner}"], figures_of(case, owner)
+def with_owners(cases: list[Case]) -> list[tuple[Case, Owner | None]]:
+    """Each case with each of its owners of beliefs."""
+    return [(case, owner) for case in cases for owner in owners(case)]
+
+
+SHIPPED = [env_id for env_id in IDS if env_id.startswith("fusion_gym/")]
+RECORDED = json.loads(FILE.read_text()) if FILE.exists() else {"options": {}, "figures": {}}
+DRAWN_CASES = [Case(env_id, o) for env_id in SHIPPED for o in RECORDED["options"].get(env_id, [])]
+NAMED_CASES = [case for case in CASES if case.env_id in SHIPPED]
+
+
+def places(cases: list[Case], mark: str) -> dict[str, tuple[Case, Owner | None]]:
+    """The cases by their keys in the file."""
+    return {f"{mark}{i} {c} {o}": (c, o) for i, (c, o) in enumerate(with_owners(cases))}
+
+
+EVERY = places(NAMED_CASES, "") | places(DRAWN_CASES, "drawn ")
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("key", EVERY)
+def test_figures_are_the_recorded_ones(key: str) -> None:
+    recorded, figures = RECORDED["figures"][key], figures_of(*EVERY[key])
     assert figures.keys() == recorded.keys()
     for name, (total, size) in figures.items():
         assert total == pytest.approx(recorded[name][0], rel=0.0, abs=TOLERANCE * size + 1e-12), (
@@ -73,5 +124,10 @@ def test_figures_are_the_recorded_ones(case: Case, owner: Owner | None) -> None:
 
 
 if __name__ == "__main__":
-    text = {f"{case} {owner}": figures_of(case, owner) for case, owner in EVERY}
-    FILE.write_text(json.dumps(text, indent=0) + "\n")
+    warnings.simplefilter("ignore")
+    options = {env_id: drawn_options(env_id) for env_id in SHIPPED}
+    drawn = [Case(env_id, own) for env_id in SHIPPED for own in options[env_id]]
+    every = places(NAMED_CASES, "") | places(drawn, "drawn ")
+    figures = {key: json.dumps(figures_of(*pair)) for key, pair in every.items()}
+    lines = ",\n".join(f"{json.dumps(key)}: {row}" for key, row in figures.items())
+    FILE.write_text(f'{{"options": {json.dumps(options)},\n"figures": {{\n{lines}\n}}}}\n')

@@ -138,7 +138,8 @@ class RecordedSystem(CensoredSystem):
 
     def start(self, noise: Array) -> RecordedState:
         """See :class:`System`; the last normal is the time of day."""
-        own = noise[2 * self.plant.size : -1]
+        first = 2 * self.plant.size
+        own = noise[first : first + self.sensor_count]
         plain = CensoredSystem.start(replace(self, known_start=False), np.nan_to_num(noise[:-1]))
         values = {item.name: getattr(plain, item.name) for item in fields(plain)}
         state = RecordedState(**values, available=np.isfinite(own), day=noise[-1])
