@@ -76,10 +76,10 @@ def changes(plant: dict[str, Any]) -> Array:
     """Return the deviations (sensors,) of what the measurements change in ten steps."""
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", tokens="unlimited", **plant)
     batch = EpisodeBatch.seeded(task, 1000, 0)
-    first = batch.state.measurement
+    first = batch.state.estimate.measurement
     for _ in range(10):
         batch.step(np.zeros((task.sensors, 1000), dtype=np.bool_))
-    result: Array = (batch.state.measurement - first).std(-1)[:, 0]
+    result: Array = (batch.state.estimate.measurement - first).std(-1)[:, 0]
     return result
 
 

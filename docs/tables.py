@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any, cast
 
-from fusion_gym.core.system import MEANING
+from fusion_gym.core.knowledge import MEANING
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs import pages
@@ -32,7 +32,7 @@ def fact_table(env_id: str) -> str:
     view = make_view(task := make_task(env_id))
     rows = [
         ("sensors", str(task.sensors)),
-        ("states", ", ".join(f"`{name}`" for name in task.system.state_names)),
+        ("states", ", ".join(f"`{name}`" for name in task.plant.state_names)),
         ("observation", f"{len(view.names)} float32 numbers"),
         ("action", f"`{view.actions}`"),
         ("steps of an episode", str(task.horizon)),

@@ -76,7 +76,8 @@ class PendulumOptions(CommonOptions):
 
 def build(options: PendulumOptions) -> Scenario:
     """The scenario of these options."""
-    return Scenario(options, Pendulum())
+    pendulum = Pendulum()
+    return Scenario(options, pendulum.plant, pendulum.estimator)
 
 
 fusion_gym.register("examples/Pendulum-v0", build)

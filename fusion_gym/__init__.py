@@ -15,8 +15,10 @@ from fusion_gym.version import __version__
 
 if TYPE_CHECKING:
     from fusion_gym import evaluation, jax, zoo
+    from fusion_gym.core.estimator import Estimator, Reception
+    from fusion_gym.core.knowledge import Block, Signal, age_block
     from fusion_gym.core.options import CommonOptions, Scenario
-    from fusion_gym.core.system import Block, Signal, System, age_block
+    from fusion_gym.core.plant import Plant
     from fusion_gym.core.task import Task
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.privileged import make_sb3_vec_env
@@ -32,17 +34,19 @@ __all__ = [
     "Block",
     "CommonOptions",
     "ConfigurationError",
+    "Estimator",
     "Experiment",
     "FusionEnv",
     "FusionParallelEnv",
     "FusionSB3VecEnv",
     "FusionVectorEnv",
     "NonlinearSystem",
+    "Plant",
     "Policy",
+    "Reception",
     "Rule",
     "Scenario",
     "Signal",
-    "System",
     "Task",
     "__version__",
     "age_block",
@@ -62,8 +66,10 @@ __all__ = [
 
 # Names that are imported on first access, by module; some need an extra.
 _PLACES = {
+    "core.estimator": ("Estimator", "Reception"),
+    "core.knowledge": ("Block", "Signal", "age_block"),
     "core.options": ("CommonOptions", "Scenario"),
-    "core.system": ("Block", "Signal", "System", "age_block"),
+    "core.plant": ("Plant",),
     "core.task": ("Task",),
     "envs.parallel": ("FusionParallelEnv", "parallel_env"),
     "envs.privileged": ("make_sb3_vec_env",),

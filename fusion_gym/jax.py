@@ -17,19 +17,18 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from gymnasium import spaces
 
-from fusion_gym.core.access import access_mask
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import CommonOptions
-from fusion_gym.core.runs import Branch, Outcome, Position
-from fusion_gym.core.system import Signals
+from fusion_gym.core.runs import Branch, Outcome, Position, advance, start_of
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.vector import step_infos
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.errors import refusal
 from fusion_gym.importing import require
-from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.system import CensoredEstimator
 
 require("an environment under JAX", "jax", "jax")
 import jax  # noqa: E402
@@ -86,30 +85,31 @@ class FunctionalEnv:
     def __init__(self, task: Task) -> None:
         self.task = task = dataclasses.replace(task, backend="jax")
         self.__setstate__({})
-        system = task.system
+        estimator = task.estimator
         self._memory, self._layout = Memory(task, "scheduler"), ObservationLayout(task)
         self._view = SchedulerView(task)
-        self._channels = system.noise_channels + (task.access == "random")
+        self._starts = task.plant.start_channels + task.network.start_channels
+        self._channels = task.plant.noise_channels + task.network.noise_channels
         price = task.reward.price.fixed
         self.default_params = EnvParams(price)
-        if isinstance(system, CensoredSystem):
-            shares = getattr(getattr(system.centre, "feedback", None), "share", None)
+        if isinstance(estimator, CensoredEstimator):
+            shares = getattr(getattr(estimator.centre, "feedback", None), "share", None)
             self.default_params = EnvParams(
                 price,
-                system.model.process_covariance[..., 0],
-                system.centre.sensors.variance[..., 0],
+                estimator.model.process_covariance[..., 0],
+                estimator.centre.sensors.variance[..., 0],
                 None if shares is None else shares[:, 0],
             )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        system = self.task.system
-        register_state(system.start(np.zeros((system.start_channels, 1))))
+        channels = self.task.plant.start_channels + self.task.network.start_channels
+        register_state(start_of(self.task, np.zeros((channels, 1)))[0])
 
     @property
     def name(self) -> str:
-        """Name of the system."""
-        return type(self.task.system).__name__
+        """Name of the estimator."""
+        return type(self.task.estimator).__name__
 
     @property
     def num_actions(self) -> int:
@@ -157,10 +157,9 @@ class FunctionalEnv:
     def _begin(self, params: EnvParams | None, keys: Any, _: tuple[()]) -> tuple[Any, Position]:
         """Return observations (N, entries) and state of N runs from their keys."""
         noise, price = jax.vmap(jax.random.split, out_axes=1)(keys)
-        channels = self.task.system.start_channels
-        noise = _normals(noise, channels + self._channels)
+        noise = _normals(noise, self._starts + self._channels)
         uniform = jax.vmap(jax.random.uniform)(price)
-        start, first = noise[:channels], noise[channels:]
+        start, first = noise[: self._starts], noise[self._starts :]
         return self._started(start, first, uniform, params)
 
     def _move(
@@ -267,29 +266,22 @@ class FunctionalEnv:
         if isinstance(self._view.actions, spaces.MultiBinary):
             return action.reshape(-1, 1).astype(np.bool_)
         sensors = jnp.arange(self.task.sensors)[:, None]
-        if self.task.access == "single":
+        if self.task.network.access == "single":
             return action == sensors + 1
         return (action >> sensors & 1).astype(np.bool_)
 
     def _started(
         self, start: Any, noise: Any, uniform: Any, params: EnvParams | None
     ) -> tuple[Any, Position]:
-        task, system = self._task(params), self.task.system
+        task = self._task(params)
         start, noise = jnp.asarray(start), jnp.asarray(noise)
         steps = cast(Any, jnp.zeros(noise.shape[1], dtype=np.int64))
         price: Any = task.reward.price.draw(uniform)
         if params is not None and params.price is not None:
             price = params.price
-        admitted = access_mask(self.task.access, self.task.sensors, steps, noise[-1])
-        position = Position(
-            task.system.sense(task.system.start(start), noise[: system.noise_channels]),
-            task.bucket.start(noise.shape[1]),
-            cast(Any, jnp.broadcast_to(price, steps.shape)),
-            steps,
-            steps + task.horizon,
-            task.bucket.start_queue(noise.shape[1]),
-            admitted,
-        )
+        state = advance(task, start_of(task, start)[0], noise, steps)
+        prices = cast(Any, jnp.broadcast_to(price, steps.shape))
+        position = Position(state, prices, steps, steps + task.horizon)
         position = jax.tree.map(jnp.asarray, position)
         return self._runs(task, position).observe(), position
 
@@ -303,9 +295,10 @@ class FunctionalEnv:
         changed = {name: value for name, value in values.items() if value is not None}
         if not changed:
             return self.task
-        if not isinstance(self.task.system, CensoredSystem):
+        estimator = self.task.estimator
+        if not isinstance(estimator, CensoredEstimator):
             raise refusal("params", sorted(changed), "only price", f"in {self.name}")
-        return dataclasses.replace(self.task, system=self.task.system.with_model(**changed))
+        return dataclasses.replace(self.task, estimator=estimator.with_model(**changed))
 
 
 def _normals(keys: Any, channels: int) -> Any:

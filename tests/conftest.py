@@ -26,8 +26,8 @@ def unsearched(monkeypatch: pytest.MonkeyPatch) -> None:
 
     from fusion_gym.policies.periodic_optimum import Schedule
 
-    def optimum(system: Any, packets: int, period: int, *_: Any) -> Schedule:
-        return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
+    def optimum(task: Any, packets: int, period: int, *_: Any) -> Schedule:
+        return Schedule(np.ones((period, task.sensors), dtype=np.bool_), float(packets))
 
     monkeypatch.setattr("fusion_gym.policies.periodic_optimum.optimum", optimum)
 

@@ -15,7 +15,7 @@ from structured_systems import request
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.system import CensoredPlant
 
 DIGITS = 50
 Exact = NDArray[np.object_]
@@ -135,9 +135,8 @@ def largest_errors(
     left out.
     """
     random, batch = np.random.default_rng(0), EpisodeBatch.seeded(task, runs, seed=0)
-    system = task.system
-    assert isinstance(system, CensoredSystem)
-    plant, sensors = system.plant, system.centre.sensors
+    assert isinstance(task.plant, CensoredPlant)
+    plant, sensors = task.plant.dynamics, task.plant.sensors
     filters = [
         ExactFilter(
             *(value[..., 0] for value in (plant.transition, plant.process_covariance)),
@@ -151,15 +150,16 @@ def largest_errors(
     ]
     if "joint_measurement_covariance" in task.settings:  # of LinearFusion: its start is known
         for run, one in enumerate(filters):
-            one.take(batch.state.held[..., run], np.ones(task.sensors, dtype=np.bool_))
+            one.take(batch.state.estimate.held[..., run], np.ones(task.sensors, dtype=np.bool_))
     variance_error = mean_error = mpf(0)
     for step in range(min(steps, task.horizon)):
-        measurement = batch.state.measurement
+        measurement = batch.state.plant.measurement
         requests = request(random, step, task.sensors, runs)
         if silent:
             requests = after_silence(task.horizon, step, task.sensors, runs)
         outcome = batch.step(requests)
-        mean, covariance = (exact(value) for value in system.fused(batch.delivered))
+        estimate = batch.delivered.estimate
+        mean, covariance = exact(estimate.mean), exact(estimate.covariance)
         for run, one in enumerate(filters):
             one.step(measurement[..., run], outcome.granted[:, run])
             variance = np.diagonal(one.covariance)

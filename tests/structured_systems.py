@@ -397,7 +397,8 @@ def reason(message: str) -> str:
 
 def flaw(batch: EpisodeBatch, reward: Array, known: tuple[int, ...]) -> str | None:
     """What is wrong after a step, of all runs."""
-    mean, covariance = batch.task.system.fused(batch.delivered)
+    estimator, estimate = batch.task.estimator, batch.delivered.estimate
+    mean, covariance = estimator.mean(estimate), estimator.covariance(estimate)
     values = {"observation": batch.observe(), "reward": reward, "mean": mean, "cov": covariance}
     for name, value in values.items():
         if not np.isfinite(value).all():

@@ -11,7 +11,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.runs import Branch
 from fusion_gym.core.task import Task
-from fusion_gym.envs.privileged import PrivilegedVecEnv, make_sb3_vec_env, reference_system
+from fusion_gym.envs.privileged import PrivilegedVecEnv, make_sb3_vec_env, reference_estimator
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
@@ -50,7 +50,8 @@ def build_parts(name: str) -> Task:
 
 def contents(runs: Any) -> list[bytes]:
     """Everything that runs show of themselves."""
-    parts = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted(), runs.queue]
+    parts = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted()]
+    parts.append(runs.state.network.queue)
     return [np.ascontiguousarray(part).tobytes() for part in parts]
 
 
@@ -143,7 +144,7 @@ def test_the_reference_takes_in_every_measurement(name: str, local: bool) -> Non
     options = {**options, "horizon": 4} | ({"information": "sensors"} if local else {})
     task = fusion_gym.make_task(env_id, **options)
     owner: Owner | None = ("own" if local else "scheduler") if task.memory else None
-    batch = EpisodeBatch(task, RUNS, owner, reference_system(env_id, options))
+    batch = EpisodeBatch(task, RUNS, owner, reference_estimator(env_id, options))
     plain = EpisodeBatch(task, RUNS, owner)
     free = fusion_gym.make_task(env_id, **options | {"tokens": "unlimited"})
     receiving = EpisodeBatch(free, RUNS, owner)
@@ -171,7 +172,7 @@ def test_rewards_of_a_training_are_made_of_the_two_errors(error: str) -> None:
     """And those of the alternatives too; what infos tell of an episode is the task's own."""
     options = {"filter": "tobit", "horizon": 3, "state_weights": [1.0, 2.0], "error_weight": 0.5}
     task = fusion_gym.make_task(OSCILLATOR, **options)
-    reference = reference_system(OSCILLATOR, options)
+    reference = reference_estimator(OSCILLATOR, options)
     env = PrivilegedVecEnv(task, RUNS, error=error, reference=reference)
     true = EpisodeBatch(task, RUNS, None, reference)
     env.seed(7)
@@ -213,9 +214,9 @@ def test_a_training_error_that_does_not_fit_is_refused() -> None:
         PrivilegedVecEnv(task, 2, error="mismatch")
     claimed = fusion_gym.make_task(OSCILLATOR, error="trace")
     with pytest.raises(ConfigurationError, match="error = 'excess' is not allowed"):
-        PrivilegedVecEnv(claimed, 2, error="excess", reference=task.system)
+        PrivilegedVecEnv(claimed, 2, error="excess", reference=task.estimator)
     with pytest.raises(ConfigurationError, match="memory_filter"):
-        reference_system("fusion_gym/RemoteEstimation-v1", {}, "adf")
+        reference_estimator("fusion_gym/RemoteEstimation-v1", {}, "adf")
 
 
 @pytest.mark.parametrize("local", [False, True])

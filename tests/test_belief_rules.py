@@ -11,7 +11,8 @@ from scipy.stats import multivariate_normal
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.beliefs import Beliefs
-from fusion_gym.core.system import Signals
+from fusion_gym.core.estimator import Reception
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.rules.estimate_difference import EstimateDifference
 from fusion_gym.policies.rules.kullback_leibler import KullbackLeibler
@@ -44,9 +45,11 @@ def weighted(task: Task, difference: Array) -> Array:
 
 def after(task: Task, state: Any, *sensors: int) -> tuple[Array, Array]:
     """The centre's mean and covariance when these transmit."""
-    granted = np.zeros((task.sensors, task.system.truth(state).shape[-1]), dtype=np.bool_)
+    estimator = task.estimator
+    granted = np.zeros((task.sensors, state.measurement.shape[-1]), dtype=np.bool_)
     granted[list(sensors)] = True
-    return task.system.fused(task.system.deliver(state, granted))
+    updated = estimator.update(state, Reception(granted))
+    return estimator.mean(updated), estimator.covariance(updated)
 
 
 def share(requests: Array) -> None:
@@ -59,11 +62,11 @@ def test_the_value_is_in_squared_units_of_the_states(memory: bool) -> None:
     """‖x* - x̂‖² - ‖x* - x̂(s)‖² at least the threshold; equality is enough."""
     task = task_of(memory=memory, state_weights=(1.0, 3.0))
     batch = later(task)
-    best = after(task, batch.state, *range(3))[0]
+    best = after(task, batch.state.estimate, *range(3))[0]
     if memory:
-        best = after(task, batch.memory.states.every, *range(3))[0]  # type: ignore[union-attr]
-    silent = weighted(task, best - after(task, batch.state)[0])
-    each = [weighted(task, best - after(task, batch.state, s)[0]) for s in range(3)]
+        best = after(task, batch.memory.states["every"], *range(3))[0]
+    silent = weighted(task, best - after(task, batch.state.estimate)[0])
+    each = [weighted(task, best - after(task, batch.state.estimate, s)[0]) for s in range(3)]
     value = silent - np.array(each)
     np.testing.assert_allclose(batch.signals()["transmission_value"], value, rtol=1e-9, atol=1e-12)
     requests = ValueOfInformation(task, threshold=0.02)(batch.signals())
@@ -123,10 +126,13 @@ def test_steps_ahead_sum_what_is_left_of_the_difference() -> None:
     """Without noise and transmissions every estimate is moved by the plant alone."""
     task = task_of(memory=True, filter="kalman", censoring_threshold=-np.inf)
     batch = later(task)
-    matrix = np.array(task.system.plant.transition)[..., 0]  # type: ignore[attr-defined]
-    best = after(task, batch.memory.states.every, 0, 1, 2)[0]  # type: ignore[union-attr]
+    matrix = np.array(task.plant.dynamics.transition)[..., 0]  # type: ignore[attr-defined]
+    best = after(task, batch.memory.states["every"], 0, 1, 2)[0]
     total = np.zeros((4, batch.num_envs))
-    centres = [after(task, batch.state)[0], *(after(task, batch.state, s)[0] for s in range(3))]
+    centres = [
+        after(task, batch.state.estimate)[0],
+        *(after(task, batch.state.estimate, s)[0] for s in range(3)),
+    ]
     for power in range(3):
         moved = np.linalg.matrix_power(matrix, power)
         total += np.array([weighted(task, moved @ (best - centre)) for centre in centres])
@@ -140,7 +146,7 @@ def test_steps_ahead_sum_what_is_left_of_the_difference() -> None:
 def test_what_differs_is_measured_in_the_states_unit_or_whitened() -> None:
     task = task_of(memory=True, state_weights=(1.0, 3.0))
     batch = later(task)
-    signals, silent = batch.signals(), after(task, batch.state)
+    signals, silent = batch.signals(), after(task, batch.state.estimate)
     apart = signals["belief_difference"]
     norm = np.sqrt(weighted(task, apart))
     white = np.sqrt([
@@ -164,9 +170,9 @@ def test_a_sensor_without_memory_looks_at_what_its_measurement_would_change(env_
     """A threshold on |W^½ (x̂(s) - x̂)|."""
     task = task_of(env_id, access="any")
     batch = later(task, "own", runs=8)
-    assert batch.memory.states is None
-    silent = after(task, batch.state)[0]
-    each = [after(task, batch.state, s)[0] - silent for s in range(task.sensors)]
+    assert not batch.memory.states
+    silent = after(task, batch.state.estimate)[0]
+    each = [after(task, batch.state.estimate, s)[0] - silent for s in range(task.sensors)]
     size = np.sqrt(weighted(task, np.array(each)))
     threshold = float(np.median(size))
     requests = EstimateDifference(task, threshold=threshold, own=True)(batch.signals())

@@ -16,7 +16,7 @@ from agents.benchmark import rules, settings, tables, verdict
 from agents.benchmark.report import draw_class, headline_text, mean_text
 from agents.benchmark.settings import CLASSES, knowledge_of, load_suite
 from agents.benchmark.verdict import cost_difference, discoveries, mean_difference
-from fusion_gym.core.system import covers
+from fusion_gym.core.knowledge import covers
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.rule_search import ThresholdTrial
 from fusion_gym.policies.registry import make_policy

@@ -15,6 +15,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.system import CensoredEstimator
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
@@ -84,17 +85,17 @@ def test_oscillator_meets_its_figures(
 def test_federation_is_the_centralised_tobit_filter() -> None:
     """Against a plain loop over the scheduled sensor, per run, on the same measurements."""
     task = fusion_gym.make_task(OSCILLATOR)
-    system, policy = task.system, make_policy("round_robin", task)
+    policy = make_policy("round_robin", task)
     batch = EpisodeBatch.seeded(task, 4, 0)
     policy.reset(4)
-    plant = system.plant
+    plant: Any = task.plant.dynamics  # type: ignore[attr-defined]
     transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
     means = [plant.initial_mean[:, 0].copy() for _ in range(4)]
     covariances = [plant.initial_covariance[..., 0].copy() for _ in range(4)]
     for step in range(30):
         measurement = batch.signals()["measurement"].copy()
         batch.step(policy(batch.signals()))
-        mean, covariance = system.fused(batch.delivered)
+        mean, covariance = batch.delivered.estimate.mean, batch.delivered.estimate.covariance
         for run in range(4):
             prior = transition @ means[run]
             spread = transition @ covariances[run] @ transition.T + process
@@ -163,14 +164,16 @@ def test_expected_reduction_is_the_mean_over_the_measurements() -> None:
     task = fusion_gym.make_task(OSCILLATOR, filter="adf", access="any")
     batch = EpisodeBatch.seeded(task, 1, 0)
     batch.step(np.ones((2, 1), dtype=np.bool_))
-    state, centre = batch.state, task.system.centre
+    state, estimator = batch.state.estimate, task.estimator
+    assert isinstance(estimator, CensoredEstimator)
+    centre: Any = estimator.centre
     draws = 200_000
     generator = np.random.default_rng(0)
     truth = generator.multivariate_normal(
         state.prior_mean[:, 0], state.prior_covariance[..., 0], draws
     ).T
     measurement = centre.sensors.measure(truth, generator.normal(size=(2, draws)))
-    prior, weights = (state.prior_mean, state.prior_covariance), task.system.state_weights
+    prior, weights = (state.prior_mean, state.prior_covariance), estimator.state_weights
     silent, reduction = centre.variances(prior, state.prediction, weights)
     for sensor in range(2):
         granted = np.zeros((2, draws), dtype=np.bool_)

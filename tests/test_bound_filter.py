@@ -263,7 +263,7 @@ def test_other_filters_take_two_equal_rows_for_one_of_half_the_variance(kind: st
         batch = EpisodeBatch.seeded(task, 1, seed=0)
         for _ in range(9):
             batch.step(np.ones((1, 1), dtype=np.bool_))
-        covariances.append(task.system.fused(batch.delivered)[1])
+        covariances.append(batch.delivered.estimate.covariance)
     np.testing.assert_allclose(*covariances, rtol=1e-12)
     with pytest.raises(ConfigurationError, match="row ranks"):
         fusion_gym.make_task("fusion_gym/TobitOscillator-v1", measurement_matrices=rows)

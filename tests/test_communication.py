@@ -28,14 +28,14 @@ class Kalman:
     """FilterPy's filter of every run, with the numbers of a task's plant and sensors."""
 
     def __init__(self, batch: EpisodeBatch) -> None:
-        system: Any = batch.task.system
-        plant, self.sensors = system.plant, system.centre.sensors
+        plant: Any = batch.task.plant
+        model, self.sensors, estimate = plant.dynamics, plant.sensors, batch.state.estimate
         self.filters = []
         for run in range(batch.num_envs):
-            item = filterpy.kalman.KalmanFilter(dim_x=plant.size, dim_z=self.sensors.size)
-            item.F, item.Q = np.array(plant.transition)[..., 0], plant.process_covariance[..., 0]
-            item.x = np.array(batch.state.prior_mean)[:, run]
-            item.P = np.array(batch.state.prior_covariance)[..., run]
+            item = filterpy.kalman.KalmanFilter(dim_x=model.size, dim_z=self.sensors.size)
+            item.F, item.Q = np.array(model.transition)[..., 0], model.process_covariance[..., 0]
+            item.x = np.array(estimate.prior_mean)[:, run]
+            item.P = np.array(estimate.prior_covariance)[..., run]
             self.filters.append(item)
 
     def update(self, measurement: Array, taken: Array) -> tuple[Array, Array]:
@@ -99,9 +99,11 @@ def test_with_the_estimate_nothing_is_lost_by_silence() -> None:
     for requests in requests_at(batch):
         mean, covariance = kalman.update(batch.signals()["measurement"], everything)
         received = batch.step(requests).granted.any(0)
-        result = batch.task.system.fused(batch.delivered)
-        np.testing.assert_allclose(result[0][:, received], mean[:, received], rtol=1e-9)
-        np.testing.assert_allclose(result[1][..., received], covariance[..., received], rtol=1e-9)
+        result = batch.delivered.estimate
+        np.testing.assert_allclose(result.mean[:, received], mean[:, received], rtol=1e-9)
+        np.testing.assert_allclose(
+            result.covariance[..., received], covariance[..., received], rtol=1e-9
+        )
         kalman.predict()
         met += int(received.sum())
     assert met > RUNS
@@ -132,8 +134,8 @@ def test_nodes_receive_by_default_what_the_papers_let_them_receive(
 ) -> None:
     task: Task = fusion_gym.make_task(env_id)
     assert task.broadcast == broadcast
-    assert (task.memory, task.packet, task.memory_system) == (False, "measurement", None)
-    assert EpisodeBatch(task, 1).memory.states is None
+    assert (task.memory, task.packet, task.memory_estimator) == (False, "measurement", None)
+    assert not EpisodeBatch(task, 1).memory.states
 
 
 def test_a_single_sensor_looks_one_step_ahead() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rules import make_rule
 
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.policies.rules.random import Random
@@ -72,23 +72,23 @@ def test_actual_covariance_is_on_demand_and_changes_nothing() -> None:
         for _ in range(20):
             batch.step(policy(batch.signals()))
     np.testing.assert_array_equal(plain.observe(), tracked.observe())
-    assert plain.state.joint is None
+    assert plain.state.estimate.joint is None
     with pytest.raises(ConfigurationError, match="track_actual"):
-        plain.task.system.actual_covariance(plain.delivered)
+        plain.task.estimator.actual_covariance(plain.delivered.estimate)
     offered = {name for name in tracked.signals() if "actual" in name or name == "scale"}
     assert not offered
 
 
 def test_noise_scale_is_drawn_for_each_episode() -> None:
     batch = EpisodeBatch.seeded(build(noise_scale="random", horizon=3), 4000, 0)
-    first = batch.state.scale.copy()
+    first = batch.state.plant.scale.copy()
     assert 0.4 <= first.min() < 0.41
     assert 0.99 < first.max() <= 1.0
     assert first.mean() == pytest.approx(0.7, abs=4 * 0.6 / math.sqrt(12 * 4000))
     batch.step(np.zeros((3, 4000), dtype=bool))
-    np.testing.assert_array_equal(batch.state.scale, first)
+    np.testing.assert_array_equal(batch.state.plant.scale, first)
     batch.reset()
-    assert (batch.state.scale != first).all()
+    assert (batch.state.plant.scale != first).all()
 
 
 def test_trigger_options_are_the_policys_defaults() -> None:

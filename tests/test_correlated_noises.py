@@ -60,7 +60,7 @@ def test_the_joint_filter_is_the_optimal_one() -> None:
         granted = generator.random(3) < 0.6
         covariance = optimal(granted, A @ covariance @ A.T + W)
         outcome = batch.step(np.repeat(granted[:, None], 2000, axis=1))
-        _, claimed = task.system.fused(batch.delivered)
+        claimed = task.estimator.covariance(batch.delivered.estimate)
         np.testing.assert_allclose(claimed[..., 0], covariance, atol=1e-10)
         normalised.append((outcome.error * np.linalg.solve(covariance, outcome.error)).sum(0))
     spread = np.mean(normalised, axis=0).std() / np.sqrt(2000)
@@ -109,7 +109,7 @@ def test_covariance_intersection_keeps_its_bound(fusion: str) -> None:
 def test_a_large_prior_keeps_its_digits() -> None:
     """A prior a million times as large as the noise: the posterior is that of the information."""
     task = task_of(initial_covariance=1e6 * np.eye(2))
-    claimed = EpisodeBatch.seeded(task, 1, 0).state.covariance
+    claimed = EpisodeBatch.seeded(task, 1, 0).state.estimate.covariance
     expected = np.linalg.inv(1e-6 * np.eye(2) + C.T @ np.linalg.inv(shared()) @ C)
     np.testing.assert_allclose(claimed[..., 0], expected, rtol=1e-9)
 

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 from rules import make_rule
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
@@ -121,23 +122,23 @@ def test_library_and_plain_loop_walk_the_same_trajectories(
     fusion: str, order: tuple[int, ...] | None, scale: float, rate: float | None
 ) -> None:
     task = build(fusion=fusion, order=order, noise_scale=scale)
-    system, runs, steps = task.system, 3, 150
+    parts, runs, steps = Parts.of(task), 3, 150
     draw = np.random.default_rng(8)
-    start = draw.standard_normal((system.start_channels, runs))
-    noise = draw.standard_normal((steps, system.noise_channels, runs))
+    start = draw.standard_normal((task.plant.start_channels, runs))
+    noise = draw.standard_normal((steps, task.plant.noise_channels, runs))
     requests = None if rate is None else draw.random((steps, 3, runs)) < rate
     policy = AdaptiveInnovation()
-    state, result = system.start(start), []
+    state, result = parts.start(start), []
     for step in range(steps):
-        state = system.sense(state, noise[step])
-        values = dict(system.read(state)) | {
+        state = parts.sense(state, noise[step])
+        values = dict(task.estimator.read(state.estimate)) | {
             "start": np.full(runs, step == 0),
             "tokens": np.zeros(runs),
-            "token_cost": task.bucket.cost,
+            "token_cost": task.network.bucket.cost,
         }
         granted = policy(Signals(values)) if requests is None else requests[step]
-        state = system.deliver(state, granted)
-        result.append((system.truth(state), *system.fused(state), granted))
+        state = parts.deliver(state, granted)
+        result.append((parts.truth(state), *parts.fused(state), granted))
     for run in range(runs):
         expected = reference(
             start[:3, run],
@@ -179,16 +180,16 @@ def run(policy: str = "event", episodes: int = 80, horizon: int = 600, **options
     sums = {name: [] for name in ("mse", "actual", "conservative", "rate", "worst", "inside")}
     for _ in range(horizon):
         outcome = batch.step(rule(batch.signals()))
-        state = batch.delivered
+        state = batch.delivered.estimate
         own = np.arange(4)
-        actual = task.system.actual_covariance(state)[own, own]
-        gap = np.moveaxis(state.covariance - actual, -1, 1)
+        actual = task.estimator.actual_covariance(state)[own, own]
+        gap = np.moveaxis(state.covariances - actual, -1, 1)
         deviation = np.sqrt(linalg.diagonal(actual[0]))
         sums["mse"].append(outcome.squared_error.sum(0))
         sums["actual"].append(linalg.trace(actual[0]))
-        sums["conservative"].append(linalg.trace(state.covariance[0]))
+        sums["conservative"].append(linalg.trace(state.covariances[0]))
         sums["rate"].append(outcome.granted.astype(np.float64))
-        sums["worst"].append(np.linalg.eigvalsh(gap)[..., 0] / linalg.trace(state.covariance))
+        sums["worst"].append(np.linalg.eigvalsh(gap)[..., 0] / linalg.trace(state.covariances))
         sums["inside"].append(np.sqrt(outcome.squared_error) <= 3 * deviation)
     worst = np.array(sums.pop("worst")).swapaxes(0, 1)
     return Run(worst=worst, **{name: np.mean(rows, axis=0) for name, rows in sums.items()})

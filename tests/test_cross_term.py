@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from training_configs import small_config
 
-from fusion_gym.core.system import System
-from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
+from fusion_gym.core.estimator import Estimator
+from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_estimator
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation import cross_term
 from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_policies, worst
@@ -31,7 +31,7 @@ def measured(
 ) -> dict[str, CrossTerm]:  # fmt: skip
     task = make_task(env_id, **options)
     built = {name: make_policy(name, task) for name in policies}
-    return cross_terms(task, reference_system(env_id, options, filter), built, episodes, seed)
+    return cross_terms(task, reference_estimator(env_id, options, filter), built, episodes, seed)
 
 
 def test_error_and_floor_are_what_an_evaluation_finds_and_the_parts_add_up() -> None:
@@ -52,8 +52,8 @@ def test_error_and_floor_are_what_an_evaluation_finds_and_the_parts_add_up() -> 
 
 def test_the_weights_are_the_rewards() -> None:
     task = make_task(OSCILLATOR, **ORDINARY, state_weights=[2.0, 0.0])
-    system = reference_system(OSCILLATOR, ORDINARY)
-    requests = cross_terms(task, system, {"a": make_policy("always", task)}, 20, 0)["a"]
+    reference = reference_estimator(OSCILLATOR, ORDINARY)
+    requests = cross_terms(task, reference, {"a": make_policy("always", task)}, 20, 0)["a"]
     results = run_episodes(task, make_policy("always", task), 20, 0)
     assert requests.error == pytest.approx(2.0 * float(results.squared_error[:, 0].mean()))
 
@@ -98,12 +98,10 @@ def test_more_policies_and_a_higher_level_make_wider_intervals() -> None:
     single = measured(OSCILLATOR, ORDINARY, ["always"])
     assert width(measured(OSCILLATOR, ORDINARY, ["always", "never", "random"])) > width(single)
     task = make_task(OSCILLATOR, **ORDINARY)
-    system, policies = (
-        reference_system(OSCILLATOR, ORDINARY),
-        {"always": make_policy("always", task)},
-    )
-    assert width(cross_terms(task, system, policies, 60, 0, level=0.999)) > width(single)
-    assert width(cross_terms(task, system, policies, 60, 0)) == width(single)
+    reference = reference_estimator(OSCILLATOR, ORDINARY)
+    policies = {"always": make_policy("always", task)}
+    assert width(cross_terms(task, reference, policies, 60, 0, level=0.999)) > width(single)
+    assert width(cross_terms(task, reference, policies, 60, 0)) == width(single)
 
 
 def test_the_worst_is_one_that_is_reported_from_zero() -> None:
@@ -147,13 +145,13 @@ def test_a_memory_that_is_there_is_the_reference_and_changes_no_reward(tmp_path:
     )
     task = make_task(OSCILLATOR, **options)
     env = make_env(experiment, task)
-    assert env.batch.reference is task.memory_system
+    assert env.batch.reference is task.memory_estimator
 
     def rewards(env: Any) -> list[Any]:
         env.seed(5)
         env.reset()
         return [env.step(np.eye(4, 3, k=step % 3 - 1, dtype=np.int8))[1] for step in range(40)]
 
-    other: System[Any] = reference_system(OSCILLATOR, options)
+    other: Estimator[Any] = reference_estimator(OSCILLATOR, options)
     apart = PrivilegedVecEnv(task, 4, error="mismatch", reference=other, stagger=True)
     np.testing.assert_array_equal(rewards(env), rewards(apart))

@@ -121,7 +121,7 @@ def doc_of(env_id: str) -> str:
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_every_option_and_entry_has_a_meaning_and_a_table(env_id: str) -> None:
     meanings = {name: option.meaning for name, option in options_in(options_of(env_id)).items()}
-    blocks = fusion_gym.make_task(env_id).system.observation
+    blocks = fusion_gym.make_task(env_id).estimator.observation
     meanings |= {block.name: block.meaning for block in blocks}
     assert not [name for name, meaning in meanings.items() if not meaning]
     page = doc_of(env_id)

@@ -58,9 +58,9 @@ def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
         while not truncated:
             requests = policy(batch.signals())[:, 0]
             _, reward, _, truncated, info = env.step(requests.astype(np.int8))
-            mean, covariance = task.system.fused(batch.delivered)
-            error = (task.system.truth(batch.delivered) - mean)[:, 0]
-            claimed = covariance[..., 0]
+            plant, estimate = batch.delivered.plant, batch.delivered.estimate
+            error = (plant.truth - estimate.mean)[:, 0]
+            claimed = estimate.covariance[..., 0]
             rows["squared_error"].append(info["squared_error"])
             rows["mse"].append(info["squared_error"].sum())
             rows["error_cost"].append(-info["reward_error"])

@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter as FilterPyFilter
+from parts import Parts
 
 from fusion_gym import ConfigurationError
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import FederatedCentre, Feedback
 from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 UNEQUAL = (0.5, 0.3, 0.2)
@@ -21,20 +22,14 @@ TRANSITION = np.array([[0.9, 0.4], [-0.4, 0.9]])
 PROCESS = np.outer([0.3, 0.1], [0.3, 0.1])  # rank one
 
 
-def make_system(kind: Any, share: Any) -> CensoredSystem:
+def make_parts(kind: Any, share: Any) -> Parts:
     """Uncensored sensors that all differ, and a process covariance without an inverse."""
-    plant = LinearPlant.create(TRANSITION, PROCESS, [2.0, -1.0], 0.4 * np.eye(2))
+    dynamics = LinearPlant.create(TRANSITION, PROCESS, [2.0, -1.0], 0.4 * np.eye(2))
     sensors = CensoredSensors.create(MATRICES, VARIANCES, -np.inf, 2)
     centre = FederatedCentre(kind(sensors), Feedback.in_shares(share, 3))
-    return CensoredSystem(
-        plant=plant,
-        model=plant,
-        centre=centre,
-        random_start=False,
-        state_names=("x1", "x2"),
-        scale=np.ones(2),
-        reference=np.ones(2),
-    )
+    names, ones = ("x1", "x2"), np.ones(2)
+    plant = CensoredPlant(dynamics, sensors, names)
+    return Parts(plant, CensoredEstimator(dynamics, centre, names, scale=ones, reference=ones))
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter, TobitKalmanFilter])
@@ -44,9 +39,9 @@ def test_uncensored_federation_is_the_centralised_kalman_filter(
     kind: Any, share: Any, arrival: str
 ) -> None:
     """Whoever delivers, and however the information is shared: the centre loses nothing."""
-    system, runs, steps = make_system(kind, share), 4, 40
+    parts, runs, steps = make_parts(kind, share), 4, 40
     generator = np.random.default_rng(6)
-    state = system.start(generator.normal(size=(system.start_channels, runs)))
+    state = parts.start(generator.normal(size=(parts.plant.start_channels, runs)))
     central = []
     for _ in range(runs):
         other = FilterPyFilter(dim_x=2, dim_z=6)
@@ -54,18 +49,18 @@ def test_uncensored_federation_is_the_centralised_kalman_filter(
         other.F, other.Q = TRANSITION, PROCESS
         central.append(other)
     for _ in range(steps):
-        state = system.sense(state, generator.normal(size=(system.noise_channels, runs)))
+        state = parts.sense(state, generator.normal(size=(parts.plant.noise_channels, runs)))
         granted = np.ones((3, runs), dtype=np.bool_)
         if arrival == "some":
             granted = generator.random((3, runs)) < 0.5
-        state = system.deliver(state, granted)
-        mean, covariance = system.fused(state)
+        state = parts.deliver(state, granted)
+        mean, covariance = parts.fused(state)
         for run, other in enumerate(central):
             other.predict()
             mask = granted[:, run]
             if mask.any():
                 other.update(
-                    state.measurement[mask, :, run].reshape(-1, 1),
+                    state.plant.measurement[mask, :, run].reshape(-1, 1),
                     R=np.diag(VARIANCES[mask].ravel()),
                     H=MATRICES[mask].reshape(-1, 2),
                 )

@@ -118,7 +118,7 @@ def test_a_second_lag_is_fitted_where_it_helps() -> None:
     plant = fit(recording(simulate(20_000, second=second)), exact=True)
     assert plant.transition[:3, 3:] == pytest.approx(second, abs=0.05)
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", **plant.options)
-    assert task.system.state_names[3:] == ("c0_lag1", "c1_lag1", "c2_lag1")
+    assert task.plant.state_names[3:] == ("c0_lag1", "c1_lag1", "c2_lag1")
     assert not task.reward.state_weights[3:].any()
 
 
@@ -236,7 +236,7 @@ def test_the_option_file_is_a_plant_of_the_environment(tmp_path: Path) -> None:
     assert printed.err.count("warning") == 0, printed.err
     content = yaml.safe_load(output.read_text())
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", system=str(output))
-    assert task.system.state_names == ("inflow", "middle", "outflow")
+    assert task.plant.state_names == ("inflow", "middle", "outflow")
     assert np.asarray(content["transition"]) == pytest.approx(A, abs=0.04)
     error = refusal("fit", ["tanks", "--channels", "lake"])
     assert "channels = 'lake' is not allowed: it must be some of inflow, middle" in error

@@ -44,7 +44,8 @@ def named_by_environments() -> set[str]:
     """Policies, commands, and the signals and entries of all environments."""
     names = {*fusion_gym.policy_names(), *COMMANDS}
     for task in map(fusion_gym.make_task, ENVIRONMENTS):
-        names |= {s.name for s in task.system.signals} | {b.name for b in task.system.observation}
+        names |= {s.name for s in task.estimator.signals}
+        names |= {b.name for b in task.estimator.observation}
     return names
 
 

@@ -7,6 +7,7 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.estimator import Reception
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
 
@@ -29,10 +30,11 @@ def make(**options: Any) -> Task:
 def test_a_random_walk_is_held_with_the_variance_of_its_age() -> None:
     batch = EpisodeBatch.seeded(make(measurement_covariances=0.25, **WALK), 3, 0)
     for step in range(1, 9):
-        assert batch.state.prior_covariance == pytest.approx(0.25 + 0.3 * batch.state.age[None])
+        state = batch.state.estimate
+        assert state.prior_covariance == pytest.approx(0.25 + 0.3 * state.age[None])
         sent = np.array([[step % 3 == 0, False, True]])
         batch.step(sent)
-        state = batch.delivered
+        state = batch.delivered.estimate
         np.testing.assert_array_equal(state.mean, state.held[0])
         assert state.covariance == pytest.approx(0.25 + 0.3 * state.age[None])
 
@@ -41,18 +43,19 @@ def test_a_random_walk_is_held_with_the_variance_of_its_age() -> None:
 def test_the_covariance_is_the_mean_squared_error_under_a_schedule(options: dict[str, Any]) -> None:
     """Four deviations of 40,000 runs; the fused state is that of generalised least squares."""
     runs, task = 40_000, make(**options)
-    batch, sensors = EpisodeBatch.seeded(task, runs, 0), task.system.centre.sensors
+    batch = EpisodeBatch.seeded(task, runs, 0)
+    sensors = task.plant.sensors  # type: ignore[attr-defined]
     deviation = sensors.deviation.reshape(-1, 1)
     rows = sensors.stacked_matrix[..., 0] / deviation
     for step in range(12):
         periods = 3 + np.arange(task.sensors)
         due = np.broadcast_to((step % periods == 0)[:, None], (task.sensors, runs))
         batch.step(due)
-        state = batch.delivered
+        state = batch.delivered.estimate
         held = state.held.reshape(-1, runs) / deviation
         expected = np.linalg.lstsq(rows, held, rcond=None)[0]
         np.testing.assert_allclose(state.mean, expected, atol=1e-12)
-        error = state.truth - state.mean
+        error = batch.delivered.plant.truth - state.mean
         products = error[:, None] * error
         tolerance = 4.0 * products.std(-1) / runs**0.5
         assert (abs(products.mean(-1) - state.covariance[..., 0]) <= tolerance).all()
@@ -62,13 +65,12 @@ def test_the_covariance_is_the_mean_squared_error_under_a_schedule(options: dict
 def test_variance_signals_are_those_of_single_deliveries() -> None:
     batch = EpisodeBatch.seeded(make(**MIXED), 4, 0)
     batch.step(np.eye(3, 4, dtype=np.bool_))
-    signals, system = batch.signals(), batch.task.system
-    weights = system.state_weights[:, None]
+    signals, estimator = batch.signals(), batch.task.estimator
     for sensor in range(3):
         sent = np.zeros((3, 4), dtype=np.bool_)
         sent[sensor] = True
-        covariance = system.deliver(batch.state, sent).covariance
-        trace = (weights * np.einsum("iin->in", covariance)).sum(0)
+        covariance = estimator.update(batch.state.estimate, Reception(sent)).covariance
+        trace = np.einsum("iin->n", covariance)
         reduced = signals["silent_variance"] - signals["variance_reduction"][sensor]
         np.testing.assert_allclose(reduced, trace, rtol=1e-12)
 

@@ -36,8 +36,8 @@ RULES = (
 @pytest.mark.parametrize(("name", "options"), dict(TASKS).items())
 def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(f"fusion_gym/{name}", **options | {"horizon": HORIZON})
-    env, source, system = FunctionalEnv(task), PhiloxNoise(), task.system
-    channels = system.noise_channels + (task.access == "random")
+    env, parts = FunctionalEnv(task), (task.plant, task.network)
+    sources = [PhiloxNoise(), PhiloxNoise(stream=1)]
     space = env.action_space()
     space.seed(0)
     reset, step = jax.jit(env.reset_env), jax.jit(env.step_env)
@@ -47,9 +47,12 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
     batch.seed(np.arange(1), [7])
     for episode in range(EPISODES):
         batch.reset()
-        start = source.start(7, episode, system.start_channels)[:, None]
-        noise = source.steps(7, episode, 0, HORIZON + 1, channels)[..., None]
-        uniform = np.array([source.uniform(7, episode)])
+        starts, steps = [], []
+        for source, part in zip(sources, parts, strict=True):
+            starts.append(source.start(7, episode, part.start_channels))
+            steps.append(source.steps(7, episode, 0, HORIZON + 1, part.noise_channels))
+        start, noise = np.hstack(starts)[:, None], np.hstack(steps)[..., None]
+        uniform = np.array([sources[0].uniform(7, episode)])
         observation, state = reset(start, noise[0], uniform)
         for place in range(HORIZON):
             np.testing.assert_allclose(observation, batch.observe()[0], rtol=1e-6, atol=1e-6)
@@ -183,7 +186,7 @@ def test_parameters_may_be_mapped() -> None:
     requests = jax.jit(jax.vmap(decide))(thresholds)
     each = [decide(x) for x in thresholds.tolist()]
     np.testing.assert_array_equal(requests, each)
-    noise = np.ones((env.task.system.noise_channels, 1))
+    noise = np.ones((env.task.plant.noise_channels, 1))
     certain = jax.jit(env.expected_step)(noise, state, 1.0 * request, params)
     _, *step = jax.jit(env.step_env)(noise, state, request, params)
     for ours, theirs in zip(jax.tree.leaves(certain), jax.tree.leaves(step), strict=True):
@@ -227,8 +230,8 @@ def test_resets_and_steps_draw_from_independent_keys() -> None:
     env, params = fusion_gym.jax.make(
         SMALL, horizon=1, initial_deviation=1.0, cost_weight="random", price_range=(1.0, 9.0)
     )
-    system, keys = env.task.system, jax.random.split(jax.random.key(0))
-    start, channels = system.start_channels, system.noise_channels
+    plant, keys = env.task.plant, jax.random.split(jax.random.key(0))
+    start, channels = plant.start_channels, plant.noise_channels
     normals = jax.random.normal(keys[0], (start + channels, 1))
     uniform = jax.random.uniform(keys[1], (1,))
     first = env.reset(jax.random.key(0), params)

@@ -65,7 +65,7 @@ def test_the_centre_is_the_optimal_filter(states: int, sizes: list[int]) -> None
         prior = moved + options["process_covariance"]
         covariance = reference(options, np.flatnonzero(requests).tolist(), prior)
         outcome = batch.step(np.repeat(requests[:, None], 400, axis=1))
-        _, fused = task.system.fused(batch.delivered)
+        fused = batch.delivered.estimate.covariance
         np.testing.assert_allclose(fused[..., 0], covariance, atol=1e-8)
         error = outcome.error
         weighted = np.linalg.solve(covariance, error)
@@ -86,7 +86,7 @@ def test_estimates_are_those_of_filterpy() -> None:
     beside.x, beside.P = options["initial_mean"].copy(), options["initial_covariance"].copy()
     beside.F, beside.Q = options["transition"], options["process_covariance"]
     beside.H, beside.R = matrix, np.diag([0.3, 0.2, 0.5])
-    first = batch.state.held[..., 0]  # known to the centre
+    first = batch.state.estimate.held[..., 0]  # known to the centre
     beside.update(np.concatenate([first[0], first[1, :1]]))
     for _ in range(30):
         measured = batch.signals()["measurement"][..., 0]
@@ -94,8 +94,7 @@ def test_estimates_are_those_of_filterpy() -> None:
         beside.predict()
         beside.update(np.concatenate([measured[0], measured[1, :1]]))
         batch.step(np.ones((2, 1), dtype=np.bool_))
-        mean, _ = task.system.fused(batch.delivered)
-        np.testing.assert_allclose(mean[:, 0], beside.x, atol=1e-9)
+        np.testing.assert_allclose(batch.delivered.estimate.mean[:, 0], beside.x, atol=1e-9)
 
 
 def test_censored_sensors_get_a_filter_that_knows_it() -> None:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from parts import Parts
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -33,15 +34,15 @@ def test_its_choice_is_the_cheapest_of_all_sets() -> None:
     task = fusion_gym.make_task(TRACKING, token_cost=(3.0, 5.0), **options)
     batch, price, steps = played(task), 0.002, 4
     selected = Lookahead(task, price, steps)(batch.signals())
-    system, weights = task.system, task.reward.state_weights[:, 0]
-    transition = system.plant.transition[..., 0]
-    best, _ = system.fused(system.deliver(batch.state, np.ones((2, 30), dtype=np.bool_)))
+    parts, weights = Parts.of(task), task.reward.state_weights[:, 0]
+    transition = task.plant.dynamics.transition[..., 0]  # type: ignore[attr-defined]
+    best, _ = parts.fused(parts.deliver(batch.state, np.ones((2, 30), dtype=np.bool_)))
     for run in range(30):
         costs = {}
         for pattern in product((False, True), repeat=2):
             granted = np.zeros((2, 30), dtype=np.bool_)
             granted[:, run] = pattern
-            mean, _ = system.fused(system.deliver(batch.state, granted))
+            mean, _ = parts.fused(parts.deliver(batch.state, granted))
             distance = mean[:, run] - best[:, run]
             total = price * (3.0 * pattern[0] + 5.0 * pattern[1])
             for _ in range(steps):
@@ -59,9 +60,11 @@ def test_losses_are_weighed_by_their_probabilities(access: str) -> None:
     }  # fmt: skip
     task = fusion_gym.make_task(REMOTE, **options)
     batch, price, runs = played(task), 1.2, 30
-    state, channel = batch.state, task.system.channel
-    error = (state.truth - state.prior) ** 2 * task.reward.state_weights
-    arrives = 1.0 - (channel.transition @ channel.drop)[state.channel, np.arange(3)[:, None]]
+    state, channel = batch.state, task.network.channel
+    assert channel is not None
+    error = (state.plant.truth - state.estimate.prior) ** 2 * task.reward.state_weights
+    loss = channel.transition @ channel.drop
+    arrives = 1.0 - loss[state.network.channel, np.arange(3)[:, None]]
     policy = Lookahead(task, price, steps=1)
     requests = policy(batch.signals())
     every = [p for p in product((0, 1), repeat=3) if access == "any" or sum(p) <= 1]
@@ -113,8 +116,8 @@ def test_what_cannot_be_is_refused() -> None:
     centre = fusion_gym.make_task(TOBIT, information="centre")
     with pytest.raises(ConfigurationError, match="information = 'centre'"):
         make_policy("lookahead", centre)
-    with pytest.raises(LookupError, match="'model'"):
-        played(centre).signals()["model"]
+    with pytest.raises(LookupError, match="'estimate'"):
+        played(centre).signals()["estimate"]
 
 
 def test_a_packet_with_an_estimate_leaves_nothing_to_a_second_one() -> None:
@@ -124,12 +127,12 @@ def test_a_packet_with_an_estimate_leaves_nothing_to_a_second_one() -> None:
     batch, price, steps = played(task), 0.01, 3
     requests = Lookahead(task, price, steps)(batch.signals())
     assert set(requests.sum(0)) == {0, 1}
-    transition = task.system.plant.transition[..., 0]  # type: ignore[attr-defined]
+    transition = task.plant.dynamics.transition[..., 0]  # type: ignore[attr-defined]
     distance, total = batch.beliefs().difference[0], np.zeros(30)
     for _ in range(steps):
         total += (task.reward.state_weights * distance**2).sum(0)
         distance = transition @ distance
-    np.testing.assert_array_equal(requests.any(0), total > price * task.bucket.cost[0, 0])
+    np.testing.assert_array_equal(requests.any(0), total > price * task.network.bucket.cost[0, 0])
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 from reference_markov_jump import PAPER, options, random_model
 from scipy.stats import multivariate_normal
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.rules.constant import Always
@@ -51,7 +52,7 @@ def test_the_linear_filters_covariance_is_that_of_its_errors(seed: int | None) -
     for value, expected in ((results.nees, 1.0), (results.mse - results.bound_trace, 0.0)):
         assert abs(value.mean() - expected) <= 4 * value.std() / np.sqrt(4000)
     assert results.nees.mean() == pytest.approx(1.0, abs=0.03)
-    assert results.bound_trace.mean() < 0.95 * task.system.open_loop(40).sum()
+    assert results.bound_trace.mean() < 0.95 * task.plant.open_loop(40).sum()
 
 
 # --- plain loops ---------------------------------------------------------------------------------
@@ -119,19 +120,19 @@ class InteractingLoop:
 @pytest.mark.parametrize("seed", [None, 1, 2])
 def test_runs_agree_with_plain_loops(seed: int | None) -> None:
     model = PAPER if seed is None else random_model(seed)
-    system = build(filter="imm", horizon=25, **options(model)).system
-    nodes = build(horizon=25, **options(model)).system
+    system = Parts.of(build(filter="imm", horizon=25, **options(model)))
+    nodes = Parts.of(build(horizon=25, **options(model)))
     draw, runs = np.random.default_rng(seed), 3
-    noise = draw.standard_normal((system.start_channels, runs))
+    noise = draw.standard_normal((system.plant.start_channels, runs))
     state, other = system.start(noise), nodes.start(noise)
     loops = [InteractingLoop(model) for _ in range(runs)]
     for time in range(1, 26):
-        noise = draw.standard_normal((system.noise_channels, runs))
+        noise = draw.standard_normal((system.plant.noise_channels, runs))
         state, other = system.sense(state, noise), nodes.sense(other, noise)
         np.testing.assert_array_equal(system.truth(state), nodes.truth(other))
-        sent = draw.random((system.sensor_count, runs)) < 0.6
+        sent = draw.random((system.plant.sensor_count, runs)) < 0.6
         taken = sent & (time % np.array(model["periods"]) == 0)[:, None]
-        measured = Signals(system.read(state))["measurement"][:, 0]
+        measured = Signals(system.estimator.read(state.estimate))["measurement"][:, 0]
         state, other = system.deliver(state, sent), nodes.deliver(other, sent)
         mean, covariance = system.fused(state)
         for run, loop in enumerate(loops):
@@ -149,14 +150,14 @@ def test_one_mode_without_fading_is_the_kalman_filter_with_correlated_noises(whe
     """The one-step predictor x' = F x + K (y - H x) with K = (F P Hᵀ + G S)(H P Hᵀ + R)⁻¹."""
     model = random_model(6, modes=1, sensors=3)
     model |= {"periods": [1, 2, 3], "values": np.ones((3, 1)), "shares": np.ones((3, 1))}
-    system = build(filter=where, horizon=30, **options(model)).system
+    system = Parts.of(build(filter=where, horizon=30, **options(model)))
     f, g, q = model["transitions"][0], model["gains"][0], model["noise"]
     draw = np.random.default_rng(0)
-    state = system.start(draw.standard_normal((system.start_channels, 1)))
+    state = system.start(draw.standard_normal((system.plant.start_channels, 1)))
     x, p = f @ model["mean"], f @ model["start"] @ f.T + g @ q @ g.T
     for time in range(1, 30):
-        state = system.sense(state, draw.standard_normal((system.noise_channels, 1)))
-        y = Signals(system.read(state))["measurement"][:, 0, 0]
+        state = system.sense(state, draw.standard_normal((system.plant.noise_channels, 1)))
+        y = Signals(system.estimator.read(state.estimate))["measurement"][:, 0, 0]
         state = system.deliver(state, np.ones((3, 1), dtype=bool))
         on = time % np.array([1, 2, 3]) == 0
         h, alpha = model["matrices"][on, 0], model["coupling"][on]
@@ -188,17 +189,18 @@ def test_modes_that_alternate_for_sure(where: str) -> None:
         batch = EpisodeBatch(task, 2)
         batch.reset()
         for step in range(10):
-            np.testing.assert_array_equal(batch.state.belief.probability[(step + 1) % 2], 1.0)
+            probability = batch.state.estimate.belief.probability
+            np.testing.assert_array_equal(probability[(step + 1) % 2], 1.0)
             batch.step(np.ones((3, 2), dtype=bool))
 
 
 @each_filter
 def test_a_far_outlier_leaves_everything_finite(where: str) -> None:
-    system = build(filter=where).system
+    system = Parts.of(build(filter=where))
     draw = np.random.default_rng(0)
-    state = system.start(draw.standard_normal((system.start_channels, 2)))
+    state = system.start(draw.standard_normal((system.plant.start_channels, 2)))
     for step in range(30):
-        noise = draw.standard_normal((system.noise_channels, 2))
+        noise = draw.standard_normal((system.plant.noise_channels, 2))
         noise[-3:] *= 1e4 if step == 10 else 1.0
         state = system.deliver(system.sense(state, noise), np.ones((3, 2), dtype=bool))
         mean, covariance = system.fused(state)

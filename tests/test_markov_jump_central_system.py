@@ -4,10 +4,11 @@ from functools import partial
 
 import numpy as np
 import pytest
+from parts import Parts
 from rules import make_rule
 
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -24,23 +25,24 @@ each_filter = pytest.mark.parametrize("where", FILTERS)
 @each_filter
 def test_nothing_that_was_not_sampled_leaks(where: str) -> None:
     """Other fadings and noises of the sensors that do not sample: nothing changes at all."""
-    system = build(filter=where).system
+    system = Parts.of(build(filter=where))
     draw, runs = np.random.default_rng(1), 6
-    state = system.start(draw.standard_normal((system.start_channels, runs)))
+    state = system.start(draw.standard_normal((system.plant.start_channels, runs)))
     nobody = np.zeros((3, runs), dtype=bool)
     for time in range(1, 8):
-        noise = draw.standard_normal((system.noise_channels, runs))
+        noise = draw.standard_normal((system.plant.noise_channels, runs))
         before, state = state, system.sense(state, noise)
-        offered = Signals(system.read(state))
+        offered = Signals(system.estimator.read(state.estimate))
         silent = np.flatnonzero(time % np.array([1, 2, 3]) != 0)
         changed = noise.copy()
         changed[-6 + silent] += 1.0
         changed[-3 + silent] += 5.0
         other = system.sense(before, changed)
-        for name, value in system.read(other).items():
+        for name, value in system.estimator.read(other.estimate).items():
             np.testing.assert_array_equal(Signals({name: value})[name], offered[name])
-        for block in system.observation:
-            np.testing.assert_array_equal(block.fill(other), block.fill(state))
+        for block in system.estimator.observation:
+            filled = (block.fill(each.estimate) for each in (other, state))
+            np.testing.assert_array_equal(*filled)
         everyone = np.ones((3, runs), dtype=bool)
         for entry, expected in zip(
             system.fused(system.deliver(other, everyone)),
@@ -61,7 +63,7 @@ def test_a_request_without_a_sample_costs_and_delivers_nothing(where: str) -> No
     outcome = batch.step(np.array([[False] * 2, [False] * 2, [True] * 2]))
     np.testing.assert_array_equal(outcome.cost, 3.0)
     assert outcome.granted[2].all()
-    np.testing.assert_array_equal(task.system.fused(batch.delivered)[1], prior)
+    np.testing.assert_array_equal(Parts.of(task).fused(batch.delivered)[1], prior)
     assert batch.signals()["age"][:, 0].tolist() == [2.0, 2.0, 2.0]
     sampled = batch.signals()["sampled"]
     assert sampled.T.tolist() == [[True, True, False]] * 2

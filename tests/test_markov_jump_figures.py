@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 from reference_markov_jump import options, random_model
 
 from agents.papers.markov_jump import trigger
@@ -38,7 +39,7 @@ def rmse(results: EpisodeResults) -> Array:
 
 
 def test_reference_level_of_the_trigger() -> None:
-    traces = build().system.full_rate_traces()  # type: ignore[attr-defined]
+    traces = build().estimator.full_rate_traces()  # type: ignore[attr-defined]
     assert len(traces) == 6
     assert traces.min() == pytest.approx(1.180, abs=5e-4)
     assert traces.max() == pytest.approx(1.293, abs=5e-4)
@@ -96,8 +97,8 @@ def agreement(policy: Policy, runs: int, steps: int, seed: int) -> tuple[Array, 
     for part in range(runs // 2000):
         for step, (batch, requests) in enumerate(walk(task, policy, 2000, seed + 2000 * part)):
             batch.step(requests)
-            mean, covariance = task.system.fused(batch.delivered)
-            error = task.system.truth(batch.delivered) - mean
+            mean, covariance = Parts.of(task).fused(batch.delivered)
+            error = task.plant.truth(batch.delivered.plant) - mean
             values[step] += linalg.outer(error, error).sum(-1) / runs
             claimed[step] += covariance.sum(-1) / runs
     return values, claimed
@@ -121,7 +122,7 @@ def test_claimed_trace_of_other_models(seed: int) -> None:
     """Asymmetric chain, two process noises, four sensors, a mean that is not zero."""
     task = build(horizon=15, **options(random_model(seed)))
     results = run_episodes(task, Random(0.3), 6000, 0)
-    assert results.bound_trace.mean() < 0.95 * task.system.open_loop(15).sum()
+    assert results.bound_trace.mean() < 0.95 * task.plant.open_loop(15).sum()
     deviation = results.mse.std() / np.sqrt(6000)
     assert abs(results.mse.mean() - results.bound_trace.mean()) <= 4 * deviation
     assert results.mse.mean() == pytest.approx(results.bound_trace.mean(), rel=0.05)
@@ -138,7 +139,7 @@ def test_centre_variance_at_seven_packets_beats_the_papers_trigger_at_nine() -> 
         batch.step(requests)
         if step >= 120:
             packets += int(requests.sum())
-            traces.append(linalg.trace(task.system.fused(batch.delivered)[1])[0])
+            traces.append(linalg.trace(Parts.of(task).fused(batch.delivered)[1])[0])
     assert packets / 20 == pytest.approx(7.0, abs=0.05)
     assert np.mean(traces) == pytest.approx(1.377, abs=2e-3)
     assert np.mean(traces) < 1.673 < 1.928

@@ -55,7 +55,7 @@ def test_an_untrained_policy_requests_at_the_initial_rate(
     for _ in range(steps):
         action, _ = model.predict(observation)
         observation, _, _, _ = env.step(action)
-    requested = env.totals[0] / (task.bucket.cost[0, 0] * task.sensors * env.totals[1])
+    requested = env.totals[0] / (task.network.bucket.cost[0, 0] * task.sensors * env.totals[1])
     # 11,520 decisions at .1: standard error .0028; the first layer's weights add a little.
     assert requested == pytest.approx(0.1, abs=0.015)
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from parts import Parts
 
 import fusion_gym.jax
 from fusion_gym import gaussian, linalg, namespace
@@ -143,13 +144,13 @@ def test_derivatives_equal_central_differences(
     """The mean squared error over 100 steps, on fixed requests and noise."""
     name, options = task_options
     task, rng = fusion_gym.make_task(f"fusion_gym/{name}", **options), np.random.default_rng(0)
-    env, system, steps = FunctionalEnv(task), task.system, 100
+    env, estimator, steps = FunctionalEnv(task), task.estimator, 100
     branch = EpisodeBatch.seeded(task, 1, 0).branch()
     requests = rng.random((steps, task.sensors, 1)) < 0.4
-    noise = rng.normal(size=(steps, system.noise_channels, 1))
-    sensors = system.centre.sensors
+    noise = rng.normal(size=(steps, branch.channels, 1))
+    sensors = estimator.centre.sensors
     start = {
-        "process_covariance": system.model.process_covariance[..., 0],
+        "process_covariance": estimator.model.process_covariance[..., 0],
         "measurement_variance": sensors.variance[..., 0],
         "information_shares": np.full(sensors.count, 1.0 / sensors.count),
         "threshold": np.full(sensors.count, 1.0),
@@ -174,14 +175,15 @@ def test_derivatives_equal_central_differences(
     def error(scale: Any) -> Any:
         if parameter == "threshold":
             return smooth(scale)
-        model = system.with_model(**{parameter: start + scale * direction})
+        changed = estimator.with_model(**{parameter: start + scale * direction})
+        parts = Parts(task.plant, changed)
 
         def step(state: Any, inputs: Any) -> Any:
-            delivered = model.deliver(state, inputs[0])
-            error = model.truth(delivered) - model.fused(delivered)[0]
-            return model.sense(delivered, inputs[1]), (error * error).sum()
+            delivered = parts.deliver(state, inputs[0])
+            error = parts.truth(delivered) - parts.fused(delivered)[0]
+            return parts.sense(delivered, inputs[1]), (error * error).sum()
 
-        first = jax.tree.map(jax.numpy.asarray, branch.state)
+        first = jax.tree.map(jax.numpy.asarray, branch.state._replace(network=None))
         return jax.lax.scan(step, first, (requests, noise))[1].mean()
 
     width = 1e-5

@@ -52,7 +52,7 @@ def played(batch: EpisodeBatch, steps: int = 17) -> list[Any]:
     draw, result = np.random.default_rng(0), []
     for step in range(steps):
         outcome = batch.step(draw.random((batch.task.sensors, batch.num_envs)) < 0.5)
-        result += [batch.noise(), outcome.error, outcome.reward, batch.price, batch.admitted()]
+        result += [batch.normals(), outcome.error, outcome.reward, batch.price, batch.admitted()]
         begin = outcome.ended | ((np.arange(batch.num_envs) % 3 == 1) & (step == 4))
         if begin.any():
             batch.reset(np.flatnonzero(begin))
@@ -125,7 +125,7 @@ def test_noise_may_come_from_elsewhere(env_id: str) -> None:
 def test_an_episode_does_not_depend_on_the_length_of_the_one_before() -> None:
     task = fusion_gym.make_task(TOBIT, horizon=9, **DRAWN)
     batch, nobody = EpisodeBatch.seeded(task, 2, 5), np.zeros((task.sensors, 2), dtype=np.bool_)
-    first = batch.noise().copy()
+    first = batch.normals().copy()
     for lengths in ((2, 1), (1, 5)):
         for run, length in enumerate(lengths):
             for _ in range(length):
@@ -135,9 +135,9 @@ def test_an_episode_does_not_depend_on_the_length_of_the_one_before() -> None:
     for _ in range(2):
         other.reset()
     batch.step(nobody), other.step(nobody)
-    assert (first != other.noise()).all()
+    assert (first != other.normals()).all()
     np.testing.assert_array_equal(batch.price, other.price)
-    np.testing.assert_array_equal(batch.noise()[:, 1], other.noise()[:, 1])
+    np.testing.assert_array_equal(batch.normals()[:, 1], other.normals()[:, 1])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -246,6 +246,6 @@ def test_units_of_single_states_change_nothing(
         one, other = (batch.step(request) for batch in batches)
         np.testing.assert_array_equal(one.granted, other.granted)
         np.testing.assert_array_equal(one.error * by[:, None], other.error)
-        truth, moved = (batch.task.system.truth(batch.state) for batch in batches)
+        truth, moved = (batch.task.plant.truth(batch.state.plant) for batch in batches)
         np.testing.assert_array_equal(truth * by[:, None], moved)
         np.testing.assert_allclose(one.reward, other.reward, rtol=1e-12)

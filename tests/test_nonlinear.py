@@ -14,6 +14,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
+from parts import Parts
 
 import fusion_gym
 from fusion_gym import linalg
@@ -67,7 +68,8 @@ def linear(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def build(options: CommonOptions) -> Scenario:
-    return Scenario(options, Linear())
+    system = Linear()
+    return Scenario(options, system.plant, system.estimator)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +108,7 @@ def test_a_linear_case_is_filterpys(linear: Any) -> None:
             if not requests[sensor, 0]:
                 beside.P, beside.x = stored
         batch.step(requests)
-        mean, covariance = linear.system.fused(batch.delivered)
+        mean, covariance = Parts.of(linear).fused(batch.delivered)
         np.testing.assert_allclose(mean[:, 0], beside.x, atol=1e-10)
         np.testing.assert_allclose(covariance[..., 0], beside.P, atol=1e-12)
 
@@ -115,21 +117,23 @@ def test_a_known_start_is_the_limit_of_uncertain_ones(monkeypatch: pytest.Monkey
     results = []
     for start in (0.0, 1e-12):
         monkeypatch.setitem(globals(), "START", start * np.eye(2))
-        system = Linear()
+        made = Linear()
+        system = Parts(made.plant, made.estimator)
         noise = np.random.default_rng(0).standard_normal((6, 6, 3))
         state = system.start(noise[0, :4])
-        assert (state.covariance == start * np.eye(2)[..., None]).all()
+        assert (state.estimate.covariance == start * np.eye(2)[..., None]).all()
         for step in noise[1:]:
             state = system.deliver(system.sense(state, step[:4]), step[4:] > 0.0)
-        results.append(np.concatenate([state.mean, state.covariance.reshape(4, 3)]))
+        mean, covariance = system.fused(state)
+        results.append(np.concatenate([mean, covariance.reshape(4, 3)]))
     np.testing.assert_allclose(*results, rtol=1e-4, atol=1e-5)
 
 
 def test_open_loop_by_simulation(linear: Any) -> None:
     plant = LinearPlant.create(A, W, MEAN, START)
     # A mean of squares over 1,000 correlated runs: about 1/√500 of it.
-    np.testing.assert_allclose(linear.system.open_loop(30), plant.open_loop(30), rtol=0.12)
-    assert linear.system.open_loop(30).tolist() == Linear().open_loop(30).tolist()
+    np.testing.assert_allclose(linear.plant.open_loop(30), plant.open_loop(30), rtol=0.12)
+    assert linear.plant.open_loop(30).tolist() == Linear().plant.open_loop(30).tolist()
 
 
 def test_the_example_runs() -> None:
@@ -190,4 +194,5 @@ class Shaped(Linear):
 
 
 def build_flat(options: CommonOptions) -> Scenario:
-    return Scenario(options, Shaped())
+    system = Shaped()
+    return Scenario(options, system.plant, system.estimator)

@@ -8,8 +8,8 @@ import pytest
 import fusion_gym
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.knowledge import Block, Signals
 from fusion_gym.core.observation import block_entries
-from fusion_gym.core.system import Block, Signals
 from fusion_gym.envs.registration import ENVIRONMENTS
 
 COMMON = {"tokens": "limited", "token_rate": 0.5, "clock": True}

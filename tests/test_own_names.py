@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from command_runs import refusal, succeed
+from parts import Parts
 from rules import make_rule
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -158,7 +159,7 @@ def test_an_error_of_ones_own(own: Path) -> None:
         )
         batch = EpisodeBatch.seeded(task, 5, 0)
         outcome = batch.step(np.ones((3, 5), dtype=np.bool_))
-        covariance = task.system.fused(batch.delivered)[1]
+        covariance = Parts.of(task).fused(batch.delivered)[1]
         np.testing.assert_allclose(
             -outcome.reward_error, 3.0 * expected(outcome.error, covariance, weights), rtol=1e-12
         )

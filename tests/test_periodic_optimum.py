@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from parts import Parts
 from reference_markov_jump import PAPER, Dense, best_weights
 
 import fusion_gym
@@ -61,13 +62,13 @@ def test_the_policy_reaches_its_trace_and_no_schedule_a_lower_one(options: Any) 
     for _ in range(120):
         outcome = batch.step(policy(batch.signals()))
         sent += outcome.granted
-        traces.append(linalg.trace(task.system.fused(batch.delivered)[1]))
+        traces.append(linalg.trace(Parts.of(task).fused(batch.delivered)[1]))
     assert sent.sum() == 2 * 2 * 120 / 3
     np.testing.assert_allclose(np.mean(traces[-6:], axis=0), policy.trace, rtol=1e-6)
     others = np.zeros((9, 36), dtype=bool)
     for number, selected in enumerate(itertools.combinations(range(9), 2)):
         others[list(selected), number] = True
-    result = steady_traces(task.system, others.reshape(3, 3, -1))
+    result = steady_traces(task, others.reshape(3, 3, -1))
     assert policy.trace == pytest.approx(result.min(), rel=1e-9)
     assert result.max() > 1.2 * result.min()
 
@@ -112,7 +113,7 @@ def test_a_search_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_systems_whose_covariances_depend_on_the_data_are_refused() -> None:
     task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
-    with pytest.raises(ConfigurationError, match=r"CensoredSystem.* depend only on deliveries"):
+    with pytest.raises(ConfigurationError, match=r"CensoredEstimator.* depend only on deliveries"):
         make_policy("periodic_optimum", task)
-    with pytest.raises(ConfigurationError, match="CensoredSystem"):
-        steady_traces(task.system, np.zeros((1, 3, 1), dtype=bool))
+    with pytest.raises(ConfigurationError, match="CensoredEstimator"):
+        steady_traces(task, np.zeros((1, 3, 1), dtype=bool))

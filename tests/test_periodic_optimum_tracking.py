@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 from scipy.optimize import minimize_scalar
 
 import fusion_gym
@@ -14,7 +15,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies import periodic_optimum
 from fusion_gym.policies.periodic_optimum import PeriodicOptimum, episode_traces
-from fusion_gym.systems.unknown_input.system import UnknownInputSystem
+from fusion_gym.systems.unknown_input.system import UnknownInputEstimator
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -52,12 +53,13 @@ def all_schedules(packets: int, period: int, sensors: int) -> NDArray[np.bool_]:
     return result.reshape(period, sensors, -1)
 
 
-def squared_by_impulses(system: Any, schedule: NDArray[np.bool_], steps: int) -> float:
-    """Exact MSE over the first steps of a system whose error is linear in its normals.
+def squared_by_impulses(task: Task, schedule: NDArray[np.bool_], steps: int) -> float:
+    """Exact MSE over the first steps of a task whose error is linear in its normals.
 
     One run for each normal, which alone is 1: the squares of what the errors gain by it add up.
     """
-    first, each = system.start_channels, system.noise_channels
+    system = Parts.of(task)
+    first, each = system.plant.start_channels, system.plant.noise_channels
     every = np.eye(first + each * steps, 1 + first + each * steps, k=1)
     state, total = system.start(every[:first]), 0.0
     for step in range(steps):
@@ -78,7 +80,7 @@ def assert_searched(
     schedules = all_schedules(packets, period, task.sensors)
     assert policy.trace == pytest.approx(traces[best], rel=rtol)
     np.testing.assert_array_equal(policy.schedule, schedules[..., best])
-    result = episode_traces(task.system, schedules, task.horizon)
+    result = episode_traces(task, schedules, task.horizon)
     np.testing.assert_allclose(result, traces, rtol=rtol)
 
 
@@ -86,22 +88,22 @@ def assert_searched(
 def test_brute_force_by_impulses(options: Any) -> None:
     task = correlated(horizon=7, **options)
     schedules = all_schedules(2, 2, 3)
-    exact = [squared_by_impulses(task.system, schedules[..., i], 7) for i in range(15)]
+    exact = [squared_by_impulses(task, schedules[..., i], 7) for i in range(15)]
     assert_searched(task, 2, 2, exact, 1e-9)
 
 
 def test_a_bound_is_not_what_is_minimised() -> None:
     task, schedules = correlated(horizon=60), all_schedules(3, 3, 3)
     actual = PeriodicOptimum(task, 3, 3, average="episode")
-    system, claims = task.system, np.zeros(84)
-    still = np.zeros((system.noise_channels, 84))
-    state = system.start(np.zeros((system.start_channels, 84)))
+    system, claims = Parts.of(task), np.zeros(84)
+    still = np.zeros((system.plant.noise_channels, 84))
+    state = system.start(np.zeros((system.plant.start_channels, 84)))
     for step in range(60):
         state = system.deliver(system.sense(state, still), schedules[step % 3])
         claims += linalg.trace(system.fused(state)[1]) / 60
     safest = schedules[..., claims.argmin()]
-    assert actual.trace < 0.98 * squared_by_impulses(system, safest, 60)
-    assert squared_by_impulses(system, actual.schedule, 60) == pytest.approx(actual.trace)
+    assert actual.trace < 0.98 * squared_by_impulses(task, safest, 60)
+    assert squared_by_impulses(task, actual.schedule, 60) == pytest.approx(actual.trace)
 
 
 def test_the_mean_over_drawn_noise_scales() -> None:
@@ -134,9 +136,9 @@ def intersected(a: Array, b: Array) -> Array:
 
 def test_brute_force_of_fused_input_nodes() -> None:
     task = unknown(fusion="sci", horizon=6)
-    system = task.system
-    assert isinstance(system, UnknownInputSystem)
-    model, sensors = system.nodes.model, system.nodes.sensors
+    estimator = task.estimator  # type: ignore[attr-defined]
+    assert isinstance(estimator, UnknownInputEstimator)
+    model, sensors = estimator.nodes.model, estimator.nodes.sensors
     memory = np.diag(model.memory[:, 0])
     forward = np.vstack((model.state_rows[..., 0], np.hstack((np.zeros((1, 4)), memory))))
     schedules, traces = all_schedules(2, 2, 3), []
@@ -162,7 +164,7 @@ def test_brute_force_of_fused_input_nodes() -> None:
 def test_brute_force_of_uncensored_nodes(name: str) -> None:
     """Federated Kalman filters with feedback are one Kalman filter; its MSE is its trace."""
     task = biased(name, horizon=30)
-    plant, sensors = task.system.plant, task.system.centre.sensors  # type: ignore[attr-defined]
+    plant, sensors = task.plant.dynamics, task.estimator.centre.sensors  # type: ignore[attr-defined]
     forward, process = plant.transition[..., 0], plant.process_covariance[..., 0]
     schedules, traces = all_schedules(2, 3, 2), []
     for number in range(schedules.shape[-1]):
@@ -178,7 +180,7 @@ def test_brute_force_of_uncensored_nodes(name: str) -> None:
         traces.append(total / 30)
     assert_searched(task, 2, 3, traces, 1e-9)
     best = all_schedules(2, 3, 2)[..., int(np.argmin(traces))]
-    assert squared_by_impulses(task.system, best, 30) == pytest.approx(min(traces), rel=1e-9)
+    assert squared_by_impulses(task, best, 30) == pytest.approx(min(traces), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -195,5 +197,5 @@ def test_brute_force_of_uncensored_nodes(name: str) -> None:
     ids=["paper", "hold", "tobit", "adf", "upper", "lower", "remote"],
 )
 def test_other_filters_of_the_same_systems_are_refused(task: Task) -> None:
-    with pytest.raises(ConfigurationError, match=r"System.* depend only on deliveries"):
+    with pytest.raises(ConfigurationError, match=r"Estimator.* depend only on deliveries"):
         PeriodicOptimum(task, 1, 1)

@@ -4,6 +4,7 @@ import copy
 import functools
 import re
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,8 @@ from what_matters import (
 import fusion_gym
 from agents.papers.walk import walk
 from fusion_gym import zoo
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import read
 from fusion_gym.evaluation import record_episode, run_episodes, watch
@@ -194,7 +195,7 @@ class Rememberer(Liar):
 def dug_up(signals: Signals, name: str) -> Any:
     """A field of the whole state, by way of a method that knows it; zeros where there is none."""
     batch: Any = getattr(signals._values["observation"], "__self__", None)
-    return 0.0 if batch is None else np.asarray(getattr(batch.state, name)[0], dtype=float)
+    return 0.0 if batch is None else np.asarray(attrgetter(name)(batch.state)[0], dtype=float)
 
 
 LIARS: dict[str, tuple[Liar, str]] = {
@@ -217,14 +218,14 @@ LIARS: dict[str, tuple[Liar, str]] = {
         Liar("own_memory", lambda s: s["transmission_value"] - 0.1, "scheduler"),
         OTHERS,
     ),
-    "plans_with_the_model": (Liar("centre", lambda s: s["model"].age), MEASUREMENTS),
+    "plans_with_the_model": (Liar("centre", lambda s: s["estimate"].age), MEASUREMENTS),
     "believes_for_others": (
         Liar("own_memory", lambda s: s["beliefs"].value(), "scheduler"),
         OTHERS,
     ),
     "is_shown_rows": (Liar("clock", lambda s: s["observation"].T[:2]), ANYTHING),
-    "knows_the_truth": (Liar("scheduler", lambda s: dug_up(s, "truth")), HIDDEN),
-    "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "lost")), HIDDEN),
+    "knows_the_truth": (Liar("scheduler", lambda s: dug_up(s, "plant.truth")), HIDDEN),
+    "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "network.lost")), HIDDEN),
 }
 
 
@@ -235,7 +236,7 @@ def loops(task: Task, policy: Any) -> dict[str, Callable[[], Any]]:
         "record": lambda: record_episode(task, policy, 0),
         "search": lambda: run_priced(task, policy, np.arange(2), np.ones(2)),
         "several": lambda: run_policies(task, [policy, policy], 2, 0),
-        "cross term": lambda: cross_terms(task, task.system, {"policy": policy}, 2, 0),
+        "cross term": lambda: cross_terms(task, task.estimator, {"policy": policy}, 2, 0),
         "watch": lambda: list(watch(task, {"policy": policy}, steps=1)),
         "papers": lambda: next(walk(task, policy, 2, 0)),
     }
@@ -256,7 +257,7 @@ REFUSED = {
     "keeps_what_it_measured": "own_value",
     "keeps_what_all_measured": "transmission_value",
     "remembers_with_all": "transmission_value",
-    "plans_with_the_model": "model",
+    "plans_with_the_model": "estimate",
     "believes_for_others": "beliefs",
     "is_shown_rows": "observation",
 }

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.priced_threshold import PricedThreshold
@@ -43,7 +43,7 @@ def share(requests: Array) -> None:
 def test_it_contains_the_value_of_information(own: bool) -> None:
     """With the tokens of a packet over what a squared error counts, the price is that rule's."""
     task = task_of(memory=True, token_cost=(1.0, 2.0, 4.0))
-    worth = tuple((task.bucket.cost[:, 0] / task.error_scale).tolist())
+    worth = tuple((task.network.bucket.cost[:, 0] / task.error_scale).tolist())
     signals = later(task, "own" if own else "scheduler").signals()
     for threshold, exponent, price, other in (
         (worth, 1.0, None, {"price": PRICE}),
@@ -93,7 +93,7 @@ def test_each_number_is_that_of_the_equation(settings: str) -> None:
     share(requests)
     theta, beta = rule.column("threshold", 3)[:, 0], rule.column("price_exponent", 3)[:, 0]
     for run in range(batch.num_envs):
-        tokens = (float(signals["tokens"][run]) + 1.0) / (task.bucket.capacity + 1.0)
+        tokens = (float(signals["tokens"][run]) + 1.0) / (task.network.bucket.capacity + 1.0)
         ratios = []
         for sensor in range(3):
             age = (float(signals["age"][sensor, run]) + 1.0) / 6.0

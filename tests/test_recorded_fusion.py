@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from parts import Parts
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -73,7 +74,7 @@ def test_the_truth_is_the_recording(order: int, tmp_path: Path) -> None:
     batch = EpisodeBatch.seeded(task, 20, 0)
     for step in range(HORIZON):
         for run, row in enumerate(rows_of(task, 20)):
-            truth = task.system.truth(batch.state)[:2, run]
+            truth = task.plant.truth(batch.state.plant)[:2, run]
             assert truth == pytest.approx(values[row.start + step], abs=1e-11)
         batch.step(np.zeros((2, 20), dtype=np.bool_))
 
@@ -131,8 +132,8 @@ def test_a_sensor_without_a_reading_does_nothing(tmp_path: Path) -> None:
         assert (batch.grantable() == present).all()
         value = batch.beliefs().value()
         assert np.abs(value[~present]).max(initial=0.0) < 1e-9
-        mean, covariance = task.system.single_deliveries(batch.state)
-        silent = task.system.deliver(batch.state, np.zeros((2, 30), dtype=np.bool_))
+        mean, covariance = task.estimator.single_deliveries(batch.state.estimate)
+        silent = Parts.of(task).deliver(batch.state, np.zeros((2, 30), dtype=np.bool_)).estimate
         for sensor, run in np.argwhere(~present):
             assert mean[sensor, :, run] == pytest.approx(silent.mean[:, run])
             assert np.array_equal(covariance[sensor, ..., run], silent.covariance[..., run])
@@ -197,15 +198,14 @@ def test_seed_and_episode_determine_the_window(tmp_path: Path) -> None:
 
 def test_prices_and_other_channels_are_drawn_as_without_a_recording(tmp_path: Path) -> None:
     price: dict[str, Any] = {"cost_weight": "random", "price_range": (0.01, 1.0)}
+    price["access"] = "random"
     task = make(write(tmp_path), **price)
     usual = fusion_gym.make_task("fusion_gym/LinearFusion-v2", **price)
-    prices = [EpisodeBatch.seeded(item, 5, 3).price for item in (task, usual)]
-    assert np.array_equal(*prices)
-    assert isinstance(task.noise, WindowNoise)
-    count = task.noise.rows.shape[1]
-    more = task.noise.steps(4, 1, 2, 6, count + 2)
-    assert np.array_equal(more[:, :count], task.noise.steps(4, 1, 2, 6, count))
-    assert np.array_equal(more[:, count:], PhiloxNoise().steps(4, 1, 2, 6, count + 2)[:, count:])
+    batches = [EpisodeBatch.seeded(item, 5, 3) for item in (task, usual)]
+    assert np.array_equal(*(batch.price for batch in batches))
+    others = [batch.normals()[batch.task.plant.noise_channels :] for batch in batches]
+    assert others[0].size == 5
+    assert np.array_equal(*others)
 
 
 def test_every_interface_replays_the_window(tmp_path: Path) -> None:
@@ -230,11 +230,11 @@ def test_resampled_noise_has_the_residuals_of_the_fitted_part(tmp_path: Path) ->
     errors = {}
     for source in ("resampled", "normal"):
         batch = EpisodeBatch.seeded(make(log, source=source), 200, 0)
-        before = batch.task.system.truth(batch.state)
+        before = batch.task.plant.truth(batch.state.plant)
         batch.step(np.zeros((2, 200), dtype=np.bool_))
-        moved = batch.task.system.truth(batch.state)[1] - before[1]
+        moved = batch.task.plant.truth(batch.state.plant)[1] - before[1]
         errors[source] = float((np.abs(moved) > 4.0).mean())
-        assert batch.task.noise is None or batch.task.system.offers("available")
+        assert batch.task.noise is None or batch.task.plant.available(batch.state.plant)
     assert errors["resampled"] == pytest.approx(0.1, abs=0.06)
     assert abs(errors["normal"] - 0.1) > abs(errors["resampled"] - 0.1)
 
@@ -298,7 +298,7 @@ def test_other_weights_of_the_made_up_log_may_be_given() -> None:
 def test_the_packaged_plant_is_fitted_to_the_packaged_log() -> None:
     plant = fit(Recording.read("tanks").select(), exact=True)
     task = fusion_gym.make_task(ENV)
-    assert np.asarray(task.system.plant.transition[..., 0]) == pytest.approx(plant.transition)
+    assert np.asarray(task.plant.dynamics.transition[..., 0]) == pytest.approx(plant.transition)
     assert task.noise is not None
 
 

@@ -15,11 +15,12 @@ import mpmath
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 from reference_tobit import Example, Run, simulate
 
 import fusion_gym
 from agents.papers.tobit_token_bucket_runs import History, record_history
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
@@ -106,23 +107,23 @@ def walk(
 
     Returns what the reference's runs hold, by name (T, …, N), and the states at time 0 (n, N).
     """
-    system, runs = task.system, start.shape[-1]
+    system, runs = Parts.of(task), start.shape[-1]
     policy = make_policy("dynamic_event", task)
     policy.reset(runs)
-    tokens = task.bucket.start(runs)
+    tokens = task.network.bucket.start(runs)
     state = system.start(start)
     initial = system.truth(state)
     rows = []
     for step in range(len(noise)):
         state = system.sense(state, noise[step])
         steps = np.full(runs, step)
-        network = {"tokens": tokens, "token_cost": task.bucket.cost}
+        network = {"tokens": tokens, "token_cost": task.network.bucket.cost}
         time = {"step": steps, "start": steps == 0}
-        signals = Signals(dict(system.read(state)) | network | time)
+        signals = Signals(dict(system.estimator.read(state.estimate)) | network | time)
         request = policy(signals) if requests is None else requests[step]
-        granted, _, tokens, _ = task.bucket.grant(tokens, request)
+        granted, _, tokens, _ = task.network.bucket.grant(tokens, request)
         state = system.deliver(state, granted)
-        estimates = (*system.fused(state), system.local_means(state))
+        estimates = (*system.fused(state), system.estimator.local_means(state.estimate))
         rows.append(
             [np.array(x) for x in (system.truth(state), *estimates, tokens, request, granted)]
         )
@@ -136,10 +137,10 @@ def test_library_and_reference_walk_the_same_trajectories(case: str) -> None:
     task, example = make_task(**options), example_of(options)
     kind = options.get("filter", "paper")
     steps, runs = 60, 3 if kind == "paper" else 10
-    system = task.system
+    plant = task.plant
     generator = np.random.default_rng(17)
-    start = generator.standard_normal((system.start_channels, runs))
-    noise = generator.standard_normal((steps, system.noise_channels, runs))
+    start = generator.standard_normal((plant.start_channels, runs))
+    noise = generator.standard_normal((steps, plant.noise_channels, runs))
     requests = None
     if "random" in how:
         requests = generator.random((steps, 3, runs)) < how["random"]
@@ -147,7 +148,7 @@ def test_library_and_reference_walk_the_same_trajectories(case: str) -> None:
 
     # Standard normals in physical units: the factor of a covariance is a convention, its square
     # isn't; the measurement noises come last, sensor by sensor.
-    factor = system.plant.process_factor[..., 0]
+    factor = plant.dynamics.process_factor[..., 0]
     np.testing.assert_allclose(factor @ factor.T, example.process_covariance, atol=1e-16)
     rank = factor.shape[1]
     root = np.sqrt(np.array(example.variances))
@@ -179,8 +180,8 @@ def test_library_and_reference_walk_the_same_trajectories(case: str) -> None:
 
 def test_initial_states_have_the_examples_distribution() -> None:
     task, runs = make_task(), 100_000
-    normals = np.random.default_rng(2).standard_normal((task.system.start_channels, runs))
-    initial = task.system.truth(task.system.start(normals))
+    normals = np.random.default_rng(2).standard_normal((task.plant.start_channels, runs))
+    initial = task.plant.truth(task.plant.start(normals)[0])
     room = 5 * math.sqrt(0.1 / runs)
     assert np.abs(initial.mean(1) - [5.0, 0.0]).max() <= room
     assert np.abs(np.cov(initial) - 0.1 * np.eye(2)).max() <= 5 * 0.1 * math.sqrt(2 / runs)
@@ -337,9 +338,9 @@ class WronglyInformed(TobitKalmanFilter):
 
 def misinformed_task(factor: float, **options: Any) -> Task:
     task = make_task(filter="tobit", **options)
-    centre = task.system.centre
+    centre = task.estimator.centre
     centre = dataclasses.replace(centre, filter=WronglyInformed(centre.sensors, factor))
-    return dataclasses.replace(task, system=dataclasses.replace(task.system, centre=centre))
+    return dataclasses.replace(task, estimator=dataclasses.replace(task.estimator, centre=centre))
 
 
 def consistency(task: Task, policy: str) -> tuple[float, float]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Rule
 from fusion_gym.policies.registry import (

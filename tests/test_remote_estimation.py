@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from parts import Parts
 from rules import make_rule
 
 from fusion_gym.core.batch import EpisodeBatch
@@ -72,7 +73,7 @@ def test_simple_channels_and_certain_starts() -> None:
 )
 def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, Any]) -> None:
     task = build(horizon=60, cost_weight=3.0, **options)
-    sensors, system = task.sensors, task.system
+    sensors = task.sensors
     batch, runs = EpisodeBatch.seeded(task, 4, 7), 4
     ask = np.random.default_rng(3).random((60, sensors, runs)) < 0.3
     a = np.broadcast_to(task.settings["coefficient"], sensors)
@@ -82,7 +83,8 @@ def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, An
     sigma = np.broadcast_to(task.settings["noise_deviation"], sensors)
     for step in range(60):
         signals, state = batch.signals(), batch.state
-        truth, tokens = system.truth(state), batch.tokens.copy()
+        truth, tokens = task.plant.truth(state.plant), batch.tokens.copy()
+        lost = np.zeros_like(ask[step]) if state.network.lost is None else state.network.lost
         outcome = batch.step(ask[step])
         for run in range(runs):
             paid = 0.0
@@ -97,17 +99,17 @@ def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, An
                     math.sqrt(variance[sensor, run])
                 )
                 granted = ask[step, sensor, run] and (
-                    task.bucket.unlimited or tokens[run] >= 1.0 - 1e-12
+                    task.network.bucket.unlimited or tokens[run] >= 1.0 - 1e-12
                 )
                 assert outcome.granted[sensor, run] == granted
                 estimate[sensor, run] = predicted
                 paid += 3.0 * granted
-                if granted and not state.lost[sensor, run]:
+                if granted and not lost[sensor, run]:
                     estimate[sensor, run] = truth[sensor, run]
                     age[sensor, run], variance[sensor, run], error = 0, 0.0, 0.0
                 paid += error**2
             assert outcome.reward[run] == pytest.approx(-paid)
-        mean, covariance = system.fused(batch.delivered)
+        mean, covariance = Parts.of(task).fused(batch.delivered)
         np.testing.assert_allclose(mean, estimate, atol=1e-12)
         np.testing.assert_allclose(np.diagonal(covariance).T, variance, atol=1e-9, rtol=1e-9)
 
@@ -138,13 +140,13 @@ def test_observed_errors_do_not_saturate_where_the_decision_is_made() -> None:
     for price, weight in ((0.5, 1.0), (5.0, 0.1), (500.0, 2.0)):
         task = build(cost_weight=price, error_weight=weight)
         threshold = float(solve_average(source_problems(task)[0]).threshold[0, 0])
-        assert 0.2 < threshold / task.system.error_scale[0] < 4.0  # the range is 5 scales wide
+        assert 0.2 < threshold / task.estimator.error_scale[0] < 4.0  # the range is 5 scales wide
 
 
 @pytest.mark.parametrize("network", [{}, {"sensors": 2, "tokens": "limited", "token_rate": 0.5}])
 def test_an_agent_sees_the_same_whatever_a_packet_costs(network: dict[str, Any]) -> None:
     scales = [
-        build(**network, **price).system.error_scale
+        build(**network, **price).estimator.error_scale
         for price in ({}, {"cost_weight": 0.0}, {"cost_weight": "random", "price_range": (0.1, 9)})
     ]
     assert scales[0].tolist() == scales[1].tolist() == scales[2].tolist()
@@ -238,7 +240,7 @@ def test_tasks_without_a_solved_optimum_are_refused(options: dict[str, Any], fie
 
 
 def test_other_systems_and_unknown_criteria_are_refused() -> None:
-    with pytest.raises(ConfigurationError, match="system"):
+    with pytest.raises(ConfigurationError, match="plant"):
         OptimalPolicy(build_tracking())
     with pytest.raises(ConfigurationError, match="criterion"):
         OptimalPolicy(build(), "discounted")

@@ -59,13 +59,13 @@ def test_reports_are_those_of_a_device(
     listed = "/".join(map(repr, changes))
     rule = fusion_gym.make_policy(f"report_on_change:reportable_change={listed},{text}", task)
     batch = EpisodeBatch.seeded(task, 3, seed)
-    held = batch.state.held
+    held = batch.state.estimate.held
     devices = [
         [Device(changes[s], percent, least, most, held[s, :, n]) for n in range(3)]
         for s in range(2)
     ]
     for _ in range(40):
-        value = batch.state.measurement
+        value = batch.state.estimate.measurement
         expected = [[devices[s][n].reports(value[s, :, n]) for n in range(3)] for s in range(2)]
         requests = rule(batch.signals())
         np.testing.assert_array_equal(requests, expected)
@@ -86,7 +86,7 @@ def test_local_rules_keep_their_intervals(name: str) -> None:
     rule.reset(50)
     gaps = []
     for _ in range(100):
-        age = batch.state.age
+        age = batch.state.estimate.age
         requests = rule(batch.signals())
         gaps += age[requests].tolist()
         assert (age <= 4).all()

@@ -105,13 +105,14 @@ def test_some_sensors_transmit_as_in_the_whole_policy_and_the_others_never(
 def test_no_filter_is_below_the_floor() -> None:
     """The floor is the Riccati equation's; uncensored, the Kalman filter has it."""
     task = fusion_gym.make_task(biased.TRACKING)
-    system = biased.censored(task)
-    transition = system.plant.transition[..., 0]
-    covariance, process = system.plant.initial_covariance[..., 0], system.plant.process_covariance
+    estimator = biased.censored(task)
+    model = estimator.model
+    transition = model.transition[..., 0]
+    covariance, process = model.initial_covariance[..., 0], model.process_covariance
     roots = []
     for step in range(task.horizon):
         covariance = transition @ covariance @ transition.T + process[..., 0]
-        row = system.centre.sensors.measurement_matrix[step % 2, 0, :, 0]
+        row = estimator.centre.sensors.measurement_matrix[step % 2, 0, :, 0]
         gain = covariance @ row / (row @ covariance @ row + (0.1, 0.3)[step % 2])
         covariance = covariance - np.outer(gain, row @ covariance)
         roots.append(np.sqrt(np.diag(covariance)))
@@ -185,7 +186,7 @@ def test_readings_are_run() -> None:
     errors = {}
     for reading in biased.ROUND_ROBIN_READINGS:
         task = biased.reading_task(reading)
-        name = "always" if task.access == "any" else "round_robin"
+        name = "always" if task.network.access == "any" else "round_robin"
         errors[reading] = biased.squares(task, name, 3, 0).mean()
     assert len(set(errors.values())) == len(biased.ROUND_ROBIN_READINGS)
     own = fusion_gym.make_task(biased.OSCILLATOR)
@@ -195,14 +196,14 @@ def test_readings_are_run() -> None:
 def test_bounds_of_a_filter_that_is_never_censored() -> None:
     """With ᾱ = β̄ = 0 the upper bound in its own correction is the Riccati equation itself."""
     task = fusion_gym.make_task(biased.TRACKING)
-    system = biased.censored(task)
-    covariance = system.plant.initial_covariance.copy()
+    model = biased.censored(task).model
+    covariance = model.initial_covariance.copy()
     upper = MatrixBound(task, 0, 1.0, True, (-1.0, True))
     lower = MatrixBound(task, 0, 1.0, False, (False, False))
     observed = Censoring(np.zeros(1), np.ones(1), np.zeros(1))
     upper.begin(covariance)
     lower.begin(covariance)
-    transition, process = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
+    transition, process = model.transition[..., 0], model.process_covariance[..., 0]
     for step in range(6):
         plain = covariance[..., 0]
         if step % 2 == 0:
@@ -247,15 +248,14 @@ def test_the_trigger_is_a_schedule_that_no_seed_changes() -> None:
 
 def test_printed_recursion_is_exact_where_its_third_term_is_put_right() -> None:
     task = example(horizon=20)
-    system = task.system
+    estimator = task.estimator  # type: ignore[attr-defined]
     everything = np.ones((20, 3), dtype=bool)
-    place = system.filters.at(np.arange(21))  # type: ignore[attr-defined]
-    exact = system.recursion.local[..., place]  # type: ignore[attr-defined]
+    exact = estimator.recursion.local[..., estimator.filters.at(np.arange(21))]
     exact = exact.transpose(4, 0, 2, 1, 3).reshape(21, 6, 6)
-    np.testing.assert_allclose(covariances(system, everything, False), exact, atol=1e-13)
-    assert np.abs(covariances(system, everything, True) - exact).max() > 1e-3
+    np.testing.assert_allclose(covariances(estimator, everything, False), exact, atol=1e-13)
+    assert np.abs(covariances(estimator, everything, True) - exact).max() > 1e-3
     silent = run_markov_jump(task, trigger(0.9), 1, 0).sent
-    printed = covariances(system, silent, False)
+    printed = covariances(estimator, silent, False)
     np.testing.assert_allclose(printed, printed.transpose(0, 2, 1), atol=1e-13)
     assert np.linalg.eigvalsh(printed).min() < -1.0
 
@@ -307,8 +307,8 @@ def test_errors_of_the_bound_itself_fill_it() -> None:
 
 def test_no_gain_that_hides_the_input_has_a_smaller_bound() -> None:
     """(18) under random gains that meet (14), against the best one and the printed one."""
-    _, system = unknown_input.make_example(example=unknown_input.CARTS, filter="paper")
-    model = models(system, 0.2, 0.09)[0]
+    _, plant = unknown_input.make_example(example=unknown_input.CARTS, filter="paper")
+    model = models(plant, 0.2, 0.09)[0]
     values = gains(model, model.covariance[None], np.array([False]), 0.5)
     a, b, c = model.transition, model.inputs, model.matrix
     phi = 1.2 * a @ model.covariance @ a.T + model.process

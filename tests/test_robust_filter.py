@@ -129,8 +129,7 @@ def walk(
     truth = np.sqrt(scale) * draw.standard_normal((n, runs))
     mean = np.zeros((count + 1, n, runs))
     covariance = np.tile(np.eye(n)[None, ..., None], (count, 1, 1, 1))
-    factor = np.array([scale])
-    joint = tracker.start(factor)
+    joint = tracker.start(1)
     dense = scale * np.kron(np.ones((count + 1, count + 1)), np.eye(n))
     for _ in range(steps):
         process = np.sqrt(scale) * draw.standard_normal((plant.noise_channels, runs))
@@ -147,11 +146,11 @@ def walk(
         mean[1:] += np.einsum("sim,smr->sir", gain[..., 0], measurement - node.expect(mean[1:]))
         mean[0] = np.einsum("sij,sjr->ir", weights[..., 0], mean)
         covariance = np.where(granted[:, None, None], outcomes.delivered_covariance, covariance)
-        joint = tracker.predict(joint, factor)
-        joint = tracker.fuse(tracker.update(joint, outcomes.gain, granted, factor), weights)
+        joint = tracker.predict(joint)
+        joint = tracker.fuse(tracker.update(joint, outcomes.gain, granted), weights)
         dense = dense_step(plant, sensors, dense, gain[..., 0], weights[..., 0], scale)
     blocks = dense.reshape(count + 1, n, count + 1, n).transpose(0, 2, 1, 3)
-    return (truth - mean).reshape(-1, runs), joint[..., 0], blocks, covariance[..., 0]
+    return (truth - mean).reshape(-1, runs), scale * joint[..., 0], blocks, covariance[..., 0]
 
 
 def dense_step(

@@ -71,7 +71,7 @@ def test_it_asks_for_what_is_worth_its_price() -> None:
     policy = make_policy(text, task)
     policy.reset(80)
     requests = policy(batch.signals())
-    error = (batch.state.truth - batch.state.prior) ** 2 * task.reward.state_weights
+    error = (batch.state.plant.truth - batch.state.estimate.prior) ** 2 * task.reward.state_weights
     worth = error * sum(0.8 ** (2 * step) for step in range(steps + 1)) - price
     best = np.where(worth.max(0) > 0.0, worth.argmax(0), -1)
     clear = (np.abs(worth) > 0.3).all(0) & (np.abs(worth[0] - worth[1]) > 0.3)
@@ -117,7 +117,7 @@ def test_only_the_ratio_of_price_and_error_weight_counts() -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
-    """Moments of the truth over many draws; system and shadow agree on everything hidden."""
+    """Moments of the truth over many draws; memory and centre have the same measurements."""
     task, policy = case(name)
     batch: Any = EpisodeBatch.seeded(task, 2, 0)
     for _ in range(4):
@@ -128,7 +128,7 @@ def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
     normals = np.random.default_rng(0).standard_normal((imagination.channels(1), 2 * count))
     imagined, noise = imagination.begin(signals, runs, normals)
     state, best = imagined.state, signals["beliefs"].best  # type: ignore[attr-defined]
-    truth = task.system.truth(state).reshape(-1, 2, count)
+    truth = task.plant.truth(state.plant).reshape(-1, 2, count)
     deviation = np.sqrt(np.einsum("iin->in", best.covariance[0]))
     if not name.startswith("unknown"):  # their input has a law of its own
         assert (np.abs(truth.mean(-1) - best.mean[0]) < 0.1 * deviation + 1e-12).all()
@@ -138,25 +138,21 @@ def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
             assert (ratio > least).all()
             assert (ratio < 1.1).all()
     else:
-        last = task.system.signal.value(state.signal, state.time - 1.0)  # type: ignore[attr-defined]
-        mask = np.isclose(last, task.system.truth(state)[-1:])
+        plant, drawn = task.plant, state.plant  # type: ignore[attr-defined]
+        last = plant.signal.value(drawn.signal, drawn.time - 1.0)
+        mask = np.isclose(last, task.plant.truth(state.plant)[-1:])
         assert mask.mean() > (0.99 if name == "unknown input" else 0.9)  # steps may have jumped
         apart = np.abs(truth.mean(-1) - best.mean[0]) / deviation
         assert (apart < 1.0).all()
     if name == "remote":
-        arrives = task.system.arrival_probability(state)  # type: ignore[attr-defined]
-        lost = state.lost.reshape(-1, 2, count).mean(-1)
+        arrives = task.network.arrival_probability(state.network)
+        lost = state.network.lost.reshape(-1, 2, count).mean(-1)
         np.testing.assert_allclose(1.0 - lost, arrives[:, [0, count]], atol=0.03)
-    if task.memory_system is not None:
-        memory_system = imagined.memory.states.every
-        np.testing.assert_array_equal(
-            task.memory_system.truth(memory_system), task.system.truth(state)
-        )
-        for hidden in ("mode", "process_noise", "scale", "signal"):
-            if hasattr(state, hidden) and hasattr(memory_system, hidden):
-                np.testing.assert_array_equal(
-                    getattr(memory_system, hidden), getattr(state, hidden)
-                )
+    if task.memory_estimator is not None:
+        ours = imagined.memory.states["every"].measurement
+        taken = np.isfinite(ours) & np.isfinite(state.estimate.measurement)
+        assert taken.any()
+        np.testing.assert_array_equal(ours[taken], state.estimate.measurement[taken])
     assert noise.shape == (1, batch.channels, 2 * count)
 
 
@@ -178,5 +174,5 @@ def test_the_base_is_the_rest_of_the_text() -> None:
 
 def test_an_input_that_is_the_same_in_every_episode_cannot_be_imagined() -> None:
     task = fusion_gym.make_task(INPUT, input_phase=(0.0, 1.0), horizon=5)
-    with pytest.raises(ConfigurationError, match="UnknownInputSystem is not allowed here"):
+    with pytest.raises(ConfigurationError, match="is not allowed here: it must offer"):
         make_policy("rollout:base=never", task)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from parts import Parts
 from scipy import stats
 from scipy.optimize import brentq
 
@@ -230,8 +231,8 @@ def test_coordinates_make_noise_and_curvature_diagonal() -> None:
     [
         ("TobitOscillator", {"filter": "paper"}, {}, "filter .*not allowed for the bound"),
         ("BiasedOscillator", {"bias_aware": False}, {}, "bias_aware .*not allowed for the bound"),
-        ("UnknownInput", {}, {}, "system .*not allowed for the bound"),
-        ("RemoteEstimation", {}, {}, "system .*not allowed for the bound"),
+        ("UnknownInput", {}, {}, "plant .*not allowed for the bound"),
+        ("RemoteEstimation", {}, {}, "plant .*not allowed for the bound"),
         ("TobitOscillator", OSCILLATOR, {"rates": (0.0,)}, "rates"),
         ("TobitOscillator", OSCILLATOR, {"weights": (1.0, 0.0)}, "weights"),
         ("TobitOscillator", OSCILLATOR, {"accuracy": 0.0}, "accuracy"),
@@ -261,14 +262,14 @@ def test_tasks_without_the_bound_and_other_values_are_refused(
 def test_where_it_applies_silence_is_prediction(env: str, options: dict[str, Any]) -> None:
     task = make_task(f"fusion_gym/{env}-v1", horizon=5, **options)
     assert silence_model(task).floor > 0.0
-    system = task.system
+    system = Parts.of(task)
     draw = np.random.default_rng(0)
-    state = system.start(draw.standard_normal((system.start_channels, 3)))
+    state = system.start(draw.standard_normal((system.plant.start_channels, 3)))
     for granted in (True, False, False):
         before = system.fused(state)[0]
-        state = system.sense(state, draw.standard_normal((system.noise_channels, 3)))
+        state = system.sense(state, draw.standard_normal((system.plant.noise_channels, 3)))
         state = system.deliver(state, np.full((task.sensors, 3), granted))
-    matrix = system.plant.transition[..., 0]  # type: ignore[attr-defined]
+    matrix = system.estimator.model.transition[..., 0]  # type: ignore[attr-defined]
     assert system.fused(state)[0] == pytest.approx(matrix @ before, rel=1e-9, abs=1e-12)
 
 

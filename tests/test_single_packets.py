@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from parts import Parts
 
 import fusion_gym
 from fusion_gym import linalg
@@ -36,12 +37,12 @@ def sensed(task: Task, runs: int) -> Any:
 
 
 def one_by_one(task: Task, state: Any) -> tuple[Array, Array]:
-    runs = task.system.truth(state).shape[-1]
-    value = []
+    runs = task.plant.truth(state.plant).shape[-1]
+    parts, value = Parts.of(task), []
     for sensor in range(task.sensors):
         single = np.zeros((task.sensors, runs), dtype=np.bool_)
         single[sensor] = True
-        value.append(task.system.fused(task.system.deliver(state, single)))
+        value.append(parts.fused(parts.deliver(state, single)))
     return np.array([mean for mean, _ in value]), np.array([covariance for _, covariance in value])
 
 
@@ -57,9 +58,9 @@ KINDS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("runs", [1, 6])
 def test_all_at_once_is_bitwise_one_after_another(name: str, runs: int) -> None:
     task = task_of(**KINDS[name])
-    assert task.system.offers("single_deliveries")
     expected = one_by_one(task, sensed(task, runs))
-    result = task.system.single_deliveries(sensed(task, runs))
+    result = task.estimator.single_deliveries(sensed(task, runs).estimate)
+    assert result is not None
     np.testing.assert_array_equal(result[0], expected[0])
     np.testing.assert_array_equal(result[1], expected[1])
     assert len(np.unique(result[0][:, 0, 0])) == MANY
@@ -69,7 +70,9 @@ def test_the_joint_filter_agrees_up_to_rounding() -> None:
     correlated = np.eye(2 * MANY) + 0.3
     task = task_of(filter="joint", joint_measurement_covariance=correlated.tolist())
     state = sensed(task, 6)
-    expected, result = one_by_one(task, state), task.system.single_deliveries(state)
+    expected = one_by_one(task, state)
+    result = task.estimator.single_deliveries(state.estimate)
+    assert result is not None
     np.testing.assert_allclose(result[0], expected[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(result[1], expected[1], rtol=1e-9, atol=1e-12)
 
@@ -87,24 +90,3 @@ def test_diagonal_matrices_are_solved_with_the_same_roundings(rows: int) -> None
     matrix[..., 0, 1, 7] = matrix[..., 1, 0, 7] = 0.1
     expected = linalg.solve(matrix, vector[..., None, :])[..., 0, :]
     np.testing.assert_array_equal(linalg.solve_vector(matrix, vector), expected)
-
-
-def test_sources_believe_as_with_all_covariances(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Means alone, and with the covariances that nobody asked for: the same values."""
-    for owner, options in (
-        ("scheduler", {}), ("own", {}), ("own", {"broadcast": "estimate"}),
-        ("scheduler", {"channel": "independent"}),
-    ):  # fmt: skip
-        task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", sensors=5, **options)
-        result = []
-        for means_alone in (True, False):
-            if not means_alone:
-                monkeypatch.delattr(type(task.system), "fused_mean")
-            batch = EpisodeBatch.seeded(task, 4, 0, owner)
-            for _ in range(6):
-                batch.step(np.arange(20).reshape(5, 4) % 3 == 0)
-            beliefs = batch.beliefs()
-            result.append([beliefs.value(), beliefs.loss(), beliefs.sent.covariance])
-            monkeypatch.undo()
-        for ours, theirs in zip(*result, strict=True):
-            np.testing.assert_array_equal(ours, theirs)

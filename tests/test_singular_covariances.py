@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 
 import fusion_gym
 from fusion_gym import linalg
@@ -160,7 +161,7 @@ def test_noise_free_plants_stay_finite(
     rule.reset(2, 0)
     for _ in range(horizon):
         outcome = batch.step(rule(batch.signals()))
-        mean, covariance = task.system.fused(batch.delivered)
+        mean, covariance = Parts.of(task).fused(batch.delivered)
         signals = batch.signals()
         values = (batch.observe(), outcome.reward, mean, covariance, signals["variance_reduction"])
         assert all(np.isfinite(value).all() for value in values)
@@ -182,8 +183,7 @@ def test_noise_free_plants_stay_finite(
 def test_the_robust_filter_against_fifty_digits(options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(CORRELATED, **({"horizon": 60} | options))
     batch, generator = EpisodeBatch.seeded(task, 1, 0), np.random.default_rng(0)
-    system = task.system
-    plant, sensors = system.plant, system.filter.sensors
+    plant, sensors = task.plant.dynamics, task.estimator.filter.sensors
 
     def exact(values: Array) -> Any:
         return mpmath.matrix(values.tolist())
@@ -197,7 +197,7 @@ def test_the_robust_filter_against_fifty_digits(options: dict[str, Any]) -> None
         means = [exact(plant.initial_mean)] * 3
         for _ in range(task.horizon):
             granted = generator.random((3, 1)) < 0.7
-            measured = batch.state.measurement[..., 0].copy()
+            measured = batch.state.estimate.measurement[..., 0].copy()
             batch.step(granted)
             for i in range(3):
                 prior, mean = move * covariances[i] * move.T + drive * drive.T, move * means[i]
@@ -210,10 +210,12 @@ def test_the_robust_filter_against_fifty_digits(options: dict[str, Any]) -> None
                     prior -= gain * cross.T
                 covariances[i], means[i] = prior, mean
                 variance = np.array([float(prior[k, k]) for k in range(3)])
-                delivered = batch.delivered
-                got = np.diagonal(delivered.covariance[i + 1, ..., 0])
+                delivered = batch.delivered.estimate
+                got = np.diagonal(delivered.covariances[i + 1, ..., 0])
                 np.testing.assert_allclose(got, variance, rtol=1e-9)
-                apart = [float(mpmath.mpf(delivered.mean[i + 1, k, 0]) - mean[k]) for k in range(3)]
+                apart = [
+                    float(mpmath.mpf(delivered.means[i + 1, k, 0]) - mean[k]) for k in range(3)
+                ]
                 assert np.all(np.abs(apart) <= 1e-9 * np.sqrt(variance))
 
 
@@ -222,10 +224,10 @@ def test_a_decaying_state_keeps_its_own_variance_in_the_tables(name: str) -> Non
     """Nothing is delivered, so the covariance is that of the plant; the tables end long before."""
     task = fusion_gym.make_task(JUMP, horizon=150, filter=name, **PART)
     batch = EpisodeBatch.seeded(task, 1, 0)
-    _, moments = task.system.model.state_moments(150)
+    _, moments = task.estimator.model.state_moments(150)
     for time in range(1, 151):
         batch.step(np.zeros((3, 1), dtype=np.bool_))
-        covariance = task.system.fused(batch.delivered)[1]
+        covariance = Parts.of(task).fused(batch.delivered)[1]
         np.testing.assert_allclose(linalg.diagonal(covariance)[:, 0], moments[time], rtol=1e-9)
 
 

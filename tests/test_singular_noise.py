@@ -6,6 +6,7 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
+from parts import Parts
 from reference_tobit import exact_float, exact_matrix
 
 import fusion_gym
@@ -50,17 +51,17 @@ FILTERS: dict[str, dict[str, Any]] = {
 def exact_run(task: Task, steps: int, rate: float) -> Any:
     """Mean and covariance of a run after each step, and the same in 50 digits."""
     batch, rng = EpisodeBatch.seeded(task, 1, 0), np.random.default_rng(0)
-    plant, sensors = task.system.plant, task.system.centre.sensors  # type: ignore[attr-defined]
+    plant, sensors = task.plant.dynamics, task.estimator.centre.sensors  # type: ignore[attr-defined]
     move, noise = (
         exact_matrix(matrix[..., 0]) for matrix in (plant.transition, plant.process_covariance)
     )
-    centre = task.system.centre  # type: ignore[attr-defined]
+    centre = task.estimator.centre  # type: ignore[attr-defined]
     weight = getattr(centre.filter, "silence", None)
     exact_density = isinstance(centre.filter, AssumedDensityFilter)
-    mean = exact_matrix(batch.state.mean[:, 0])
-    covariance = exact_matrix(batch.state.covariance[..., 0])
+    mean = exact_matrix(batch.state.estimate.mean[:, 0])
+    covariance = exact_matrix(batch.state.estimate.covariance[..., 0])
     for _ in range(steps):
-        state = batch.state
+        state = batch.state.estimate
         granted = rng.random((sensors.count, 1)) < rate
         prior, believed = move * mean, exact_matrix(state.prior_mean[:, 0])
         mean, covariance = prior, move * covariance * move.T + noise
@@ -83,7 +84,11 @@ def exact_run(task: Task, steps: int, rate: float) -> Any:
             mean = mean + cross * ((innovation - (row * (mean - prior))[0]) / variance)
             covariance = covariance - cross * cross.T / variance
         batch.step(granted)
-        yield task.system.fused(batch.delivered), exact_float(mean)[:, 0], exact_float(covariance)
+        yield (
+            Parts.of(task).fused(batch.delivered),
+            exact_float(mean)[:, 0],
+            exact_float(covariance),
+        )
 
 
 @pytest.mark.parametrize("rate", [0.4, 1.0, 0.02])
@@ -123,7 +128,7 @@ def test_a_plant_that_decays_leaves_every_filter_finite(
     for step in range(200):
         rate = 0.0 if step % 100 > 30 else 0.4
         outcome = batch.step(rng.random((3, 10)) < rate)
-        mean, covariance = task.system.fused(batch.delivered)
+        mean, covariance = Parts.of(task).fused(batch.delivered)
         variances = np.einsum("iin->in", covariance)
         assert np.isfinite(mean).all()
         assert (variances >= 0.0).all()
@@ -146,16 +151,16 @@ def test_a_bias_that_nothing_moves_dies_out() -> None:
     for step in range(1000):
         assert np.isfinite(batch.observe()).all()
         batch.step(np.arange(4).reshape(2, 2) % 2 == step % 2)
-    assert task.system.fused(batch.delivered)[1][2, 2].max() == 0.0
+    assert Parts.of(task).fused(batch.delivered)[1][2, 2].max() == 0.0
 
 
 def test_the_first_estimate_uses_the_first_measurements() -> None:
     """Of a linear system; the papers' systems begin with the mean of the start."""
     task = fusion_gym.make_task(LINEAR, initial_covariance=4.0 * np.eye(2))
-    state = EpisodeBatch.seeded(task, 5, 0).state
+    state = EpisodeBatch.seeded(task, 5, 0).state.estimate
     np.testing.assert_allclose(state.mean, state.held[:, 0] * 4.0 / 4.25, rtol=1e-12)
     np.testing.assert_allclose(
         state.covariance, 4.0 * 0.25 / 4.25 * np.eye(2)[..., None] * np.ones(5), atol=1e-15
     )
     task = fusion_gym.make_task(TOBIT)
-    assert (EpisodeBatch.seeded(task, 5, 0).state.mean == [[5.0], [0.0]]).all()
+    assert (EpisodeBatch.seeded(task, 5, 0).state.estimate.mean == [[5.0], [0.0]]).all()

@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 from reference_tobit import exact_float, exact_matrix
 
 import fusion_gym
@@ -19,15 +20,15 @@ Flags = NDArray[np.bool_]
 def follow(
     requests: Flags, seed: int = 0, **options: Any
 ) -> tuple[list[Any], list[tuple[Array, Array]]]:
-    """States after sensing, and mean and covariance after each delivery, of (T, sensors, N)."""
+    """Estimates after sensing, mean and covariance after each delivery, of (T, sensors, N)."""
     steps, _, runs = requests.shape
     task = fusion_gym.make_task(TOBIT, tokens="unlimited", horizon=steps + 1, **options)
     batch = EpisodeBatch.seeded(task, runs, seed)
     states, result = [], []
     for request in requests:
-        states.append(batch.state)
+        states.append(batch.state.estimate)
         batch.step(request)
-        result.append(task.system.fused(batch.delivered))
+        result.append(Parts.of(task).fused(batch.delivered))
     return states, result
 
 

@@ -7,6 +7,7 @@ import pytest
 from filter_problems import Problem, outcomes, random_problem
 from filterpy.kalman import KalmanFilter as FilterPyFilter
 from numpy.typing import NDArray
+from parts import Parts
 from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_task
@@ -134,7 +135,7 @@ def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
     """Against FilterPy with all sensors stacked: y with R, or C x̂ with R + Z⁻¹ when silent."""
     weight, runs = (1.0, 0.3, 3.0), 3
     task = task_of(ROTATION, weight)
-    plant, sensors = task.system.plant, task.system.centre.sensors
+    plant, sensors = task.plant.dynamics, task.estimator.centre.sensors
     filters = []
     for _ in range(runs):
         other = FilterPyFilter(dim_x=2, dim_z=6)
@@ -147,7 +148,7 @@ def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
         granted = generator.random((3, runs)) < 0.4
         measurement = batch.signals()["measurement"].copy()
         batch.step(granted)
-        mean, covariance = task.system.fused(batch.delivered)
+        mean, covariance = Parts.of(task).fused(batch.delivered)
         for run, other in enumerate(filters):
             other.predict()
             received = np.repeat(granted[:, run], 2)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion_gym import ConfigurationError, make_task
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.token_bucket import SHARING_RULES, TokenBucket
 from fusion_gym.policies.rules.periodic import RoundRobin
 

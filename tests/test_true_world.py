@@ -5,12 +5,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from parts import Parts
 from scipy import stats
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import ENVIRONMENTS, make_task
 from fusion_gym.policies.registry import make_policy
@@ -36,11 +37,11 @@ AS_ASSUMED = {
 def sensed(env_id: str, steps: int = 1, **options: Any) -> tuple[Any, list[Any]]:
     """The task, and the states of many runs at time 0 and after each of some silent steps."""
     task = make_task(env_id, **options)
-    draw, system = np.random.default_rng(5), task.system
-    states = [system.start(draw.standard_normal((system.start_channels, RUNS)))]
+    draw, system = np.random.default_rng(5), Parts.of(task)
+    states = [system.start(draw.standard_normal((system.plant.start_channels, RUNS)))]
     silence = np.zeros((task.sensors, RUNS), dtype=np.bool_)
     for _ in range(steps):
-        noise = draw.standard_normal((system.noise_channels, RUNS))
+        noise = draw.standard_normal((system.plant.noise_channels, RUNS))
         states.append(system.deliver(system.sense(states[-1], noise), silence))
     return task, states
 
@@ -64,14 +65,14 @@ class TestNothingChangesWithoutDeparture:
             return b"".join(observed)
 
         assert course(**AS_ASSUMED) == course()
-        system = make_task(env_id).system
-        if "nature" in vars(system) and not system.offers("available"):
+        task = make_task(env_id)
+        if "nature" in vars(task.plant) and task.noise is None:
             assert course(true_process_noise=1.5) != course()
 
     def test_numbers_take_no_noise(self) -> None:
-        plain = make_task(TOBIT).system
-        moved = make_task(TOBIT, true_process_noise=2.0, true_threshold_shift=0.5).system
-        drawn = make_task(TOBIT, true_process_noise=(0.5, 2.0), true_transition=(0.9, 1.1)).system
+        plain = make_task(TOBIT).plant
+        moved = make_task(TOBIT, true_process_noise=2.0, true_threshold_shift=0.5).plant
+        drawn = make_task(TOBIT, true_process_noise=(0.5, 2.0), true_transition=(0.9, 1.1)).plant
         assert moved.start_channels == plain.start_channels
         assert drawn.start_channels == plain.start_channels + 2
         assert moved.noise_channels == drawn.noise_channels == plain.noise_channels
@@ -91,8 +92,8 @@ def test_truth_and_measurements_change_in_proportion(env_id: str, option: str) -
     values = []
     for factor in ({option: 0.9}, {}, {option: 1.1}):
         task, states = sensed(env_id, **options.get(env_id, {}), **factor)
-        signals = Signals(dict(task.system.read(states[1])))
-        values.append([signals["measurement"], signals["held"], *map(task.system.truth, states)])
+        signals = Signals(dict(task.estimator.read(states[1].estimate)))
+        values.append([signals["measurement"], signals["held"], *map(Parts.of(task).truth, states)])
     for low, plain, high in zip(*values, strict=True):
         np.testing.assert_allclose(high - plain, plain - low, atol=1e-9)
     changed = [(low != high).any() for low, _, high in zip(*values, strict=True)]
@@ -109,9 +110,9 @@ class TestNoise:
         upper = {} if env_id == TOBIT else {"censoring_upper": np.inf}
         free = {"censoring_threshold": -np.inf, **upper}
         task, states = sensed(env_id, steps=0, true_measurement_noise=factor, **free)
-        sensors = task.system.centre.sensors
-        latent = linalg.matvec(sensors.measurement_matrix, states[0].truth)
-        noise = (states[0].measurement - latent) / sensors.deviation
+        sensors = task.estimator.centre.sensors
+        latent = linalg.matvec(sensors.measurement_matrix, states[0].plant.truth)
+        noise = (states[0].plant.measurement - latent) / sensors.deviation
         assert close_variance(noise, factor**2)
 
     def test_shared_noise_multiplies_the_scale(self) -> None:
@@ -119,7 +120,7 @@ class TestNoise:
         _, states = sensed(
             CORRELATED, noise_scale=0.5, true_process_noise=3.0, true_measurement_noise=2.0
         )
-        shaken = states[1].measurement[:, 0] - states[1].truth
+        shaken = states[1].plant.measurement[:, 0] - states[1].plant.truth
         for sensor, (variance, coupling) in enumerate(
             zip((0.64, 0.36, 0.49), (0.2, 0.4, 0.1), strict=True)
         ):
@@ -132,7 +133,7 @@ class TestThresholds:
     def test_share_of_what_is_censored(self, shift: float) -> None:
         """The second state starts as N(0, 0.1) and is measured with noise of variance 0.5."""
         _, states = sensed(TOBIT, steps=0, true_threshold_shift=shift)
-        measured = states[0].measurement[:, 1]
+        measured = states[0].plant.measurement[:, 1]
         share = stats.norm.cdf(shift / np.sqrt(0.6))
         result = (measured == shift).mean(-1)
         assert np.abs(result - share).max() < 4.5 * np.sqrt(share * (1.0 - share) / RUNS)
@@ -140,7 +141,7 @@ class TestThresholds:
 
     def test_both_limits_move(self) -> None:
         _, states = sensed(BIASED, steps=3, true_threshold_shift=0.25, true_process_noise=20.0)
-        measured = np.stack([state.measurement for state in states])
+        measured = np.stack([state.plant.measurement for state in states])
         assert (measured.min(), measured.max()) == (-4.75, 5.25)
 
     def test_filters_and_signals_know_the_old_ones(self) -> None:
@@ -159,25 +160,26 @@ class TestMotion:
         gamma = np.array([[1.5, 0.6], [0.125, 0.5]])
         before, after = states
         for mode in (0, 1):
-            runs = before.mode == mode
-            moved = 0.5 * (np.eye(2) + phi[mode]) @ before.truth[:, runs]
-            moved += gamma[mode][:, None] * before.process_noise[0, runs]
-            np.testing.assert_allclose(after.truth[:, runs], moved, atol=1e-12)
+            runs = before.plant.mode == mode
+            moved = 0.5 * (np.eye(2) + phi[mode]) @ before.plant.truth[:, runs]
+            moved += gamma[mode][:, None] * before.plant.process_noise[0, runs]
+            np.testing.assert_allclose(after.plant.truth[:, runs], moved, atol=1e-12)
 
     def test_between_two_instants(self) -> None:
         """The force acts as it did."""
         task, states = sensed(INPUT, process_covariance=np.zeros((4, 4)), true_transition=1.2)
-        plant = task.system.plant
-        matrix = np.eye(4) + 1.2 * (plant.transition[..., 0] - np.eye(4))
-        force = plant.input_matrix[..., 0] @ states[1].truth[4:]
-        expected = matrix @ states[0].truth[:4] + force
-        np.testing.assert_allclose(states[1].truth[:4], expected, atol=1e-12)
+        dynamics = task.plant.dynamics
+        before, after = (task.plant.truth(state.plant) for state in states)
+        matrix = np.eye(4) + 1.2 * (dynamics.transition[..., 0] - np.eye(4))
+        force = dynamics.input_matrix[..., 0] @ after[4:]
+        expected = matrix @ before[:4] + force
+        np.testing.assert_allclose(after[:4], expected, atol=1e-12)
 
     def test_of_a_source(self) -> None:
         """A random walk is one no more: its coefficient itself is multiplied."""
         _, states = sensed(REMOTE, steps=30, coefficient=1.0, true_transition=0.8)
         stationary = (1.0 - 0.8**60) / (1.0 - 0.8**2)
-        assert close_variance(states[-1].truth, stationary)
+        assert close_variance(states[-1].plant.truth, stationary)
 
 
 class TestDraws:
@@ -189,7 +191,7 @@ class TestDraws:
 
     def test_laws(self) -> None:
         _, states = sensed(TOBIT, steps=0, **self.OPTIONS)
-        process, measurement, shift, transition = states[0].departure
+        process, measurement, shift, transition = states[0].plant.departure
         assert (measurement == 1.0).all()
         laws = (
             (process, stats.loguniform(0.5, 2.0)),
@@ -203,15 +205,20 @@ class TestDraws:
     def test_an_episode_has_one_whatever_is_requested(self) -> None:
         task = make_task(TOBIT, **self.OPTIONS)
         left_value, other = (EpisodeBatch.seeded(task, 4, 3) for _ in range(2))
-        first = left_value.state.departure.copy()
+        first = left_value.state.plant.departure.copy()
         for _ in range(5):
             left_value.step(np.ones((3, 4), dtype=np.bool_))
             other.step(np.zeros((3, 4), dtype=np.bool_))
-        np.testing.assert_array_equal(left_value.state.departure, first)
-        np.testing.assert_array_equal(other.state.departure, first)
-        np.testing.assert_array_equal(left_value.state.truth, other.state.truth)
+        np.testing.assert_array_equal(left_value.state.plant.departure, first)
+        np.testing.assert_array_equal(other.state.plant.departure, first)
+        np.testing.assert_array_equal(left_value.state.plant.truth, other.state.plant.truth)
         left_value.reset(np.array([1]))
-        assert (left_value.state.departure[0] != first[0]).tolist() == [False, True, False, False]
+        assert (left_value.state.plant.departure[0] != first[0]).tolist() == [
+            False,
+            True,
+            False,
+            False,
+        ]
 
 
 class TestWhoKnows:
@@ -220,26 +227,18 @@ class TestWhoKnows:
         """What a policy sees of a state, and simulates from it, moves as the model says."""
         departed = make_task(env_id, true_process_noise=2.0, true_transition=0.9)
         batch = EpisodeBatch.seeded(departed, 4, 0)
-        assert batch.state.departure is not None
-        observed = batch.signals()["model"]
-        assert observed.departure is None
-        nominal = make_task(env_id).system
-        draw = np.random.default_rng(1)
-        size = len(nominal.state_names)
-        noise = draw.standard_normal((nominal.imagination_channels, 4))
-        believed = np.repeat(np.eye(size)[..., None], 4, axis=-1)
-        wide = [
-            system.imagine(observed, draw_mean, believed, noise)
-            for system in (departed.system, nominal)
-            for draw_mean in (np.ones((size, 4)),)
-        ]
-        moving = draw.standard_normal((nominal.noise_channels, 4))
-        quiet = np.zeros((departed.sensors, 4), dtype=np.bool_)
-        after = [
-            system.sense(system.deliver(state, quiet), moving)
-            for system, state in zip((departed.system, nominal), wide, strict=True)
-        ]
-        np.testing.assert_array_equal(after[0].truth, after[1].truth)
+        assert batch.state.plant.departure is not None
+        observed = batch.signals()["estimate"]
+        assert not {"departure", "truth"} & set(dir(observed))
+        plants, draw = (departed.plant, make_task(env_id).plant), np.random.default_rng(1)
+        size, channels = len(plants[1].state_names), plants[1].draw_channels
+        assert channels is not None
+        noise, time = draw.standard_normal((channels, 4)), np.ones(4)
+        believed = np.ones((size, 4)), np.repeat(np.eye(size)[..., None], 4, axis=-1)
+        moving = draw.standard_normal((plants[1].noise_channels, 4))
+        drawn = [plant.draw(observed.measurement, *believed, noise, time) for plant in plants]
+        after = [plant.sense(state, moving) for plant, state in zip(plants, drawn, strict=True)]
+        np.testing.assert_array_equal(*(plants[1].truth(state) for state in after))
 
     def test_a_memory_state_lives_in_the_same_world(self) -> None:
         task = make_task(
@@ -249,12 +248,10 @@ class TestWhoKnows:
         batch = EpisodeBatch.seeded(task, 4, 0)
         for _ in range(5):
             batch.step(np.zeros((3, 4), dtype=np.bool_))
-            assert batch.memory.states is not None
-            np.testing.assert_array_equal(batch.memory.states.every.truth, batch.state.truth)
-            sampled = task.system.sensors.sampled(batch.state.time)
-            np.testing.assert_array_equal(
-                batch.memory.states.every.measurement[sampled], batch.state.measurement[sampled]
-            )
+            every = batch.memory.states["every"]
+            sampled = task.plant.sensors.sampled(batch.state.plant.time)
+            measured = (every.measurement, batch.state.estimate.measurement)
+            np.testing.assert_array_equal(*(each[:, 0][sampled] for each in measured))
 
     def test_a_rule_is_made_from_the_model(self) -> None:
         """The Whittle index and a searched schedule are those of the model."""
@@ -313,7 +310,8 @@ def test_what_is_not_allowed(env_id: str, options: dict[str, Any], text: str) ->
 
 def test_a_system_that_knows_no_departure_refuses_it() -> None:
     """A system of one's own takes the common options, and none is ignored."""
+    task = make_task(REMOTE)
     options = CommonOptions(true_process_noise=2.0, token_cost=1.0)
-    scenario = Scenario(options, make_task(REMOTE).system, np.ones(1))
+    scenario = Scenario(options, task.plant, task.estimator, np.ones(1))
     with pytest.raises(ConfigurationError, match=r"true_process_noise = 2 is not allowed here: "):
         Task.create(scenario)

@@ -9,6 +9,7 @@ from scipy.stats import norm
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.estimator import Reception
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes, summarise
 from fusion_gym.validation import ConfigurationError
@@ -37,7 +38,7 @@ def moments(low: Any, high: Any, mean: Any, deviation: Any) -> tuple[Any, Any]:
 def test_a_silent_update_is_the_truncation_by_quadrature(trigger: str) -> None:
     batch = EpisodeBatch.seeded(make(trigger, (0.7, 1e6), **FREE), 50, 0)
     for step in range(20):
-        state, sensors = batch.state, batch.task.system.centre.sensors
+        state, sensors = batch.state.estimate, batch.task.estimator.centre.sensors
         row = sensors.measurement_matrix[0, 0, :, 0]
         across = np.einsum("ijn,j->in", state.prior_covariance, row)
         variance = row @ across + sensors.variance[0, 0, 0]
@@ -46,7 +47,7 @@ def test_a_silent_update_is_the_truncation_by_quadrature(trigger: str) -> None:
         first, second = moments(middle - 0.7, middle + 0.7, mean, variance**0.5)
         gain = across / variance
         sent = np.zeros((2, 50), dtype=np.bool_)
-        silent = batch.task.system.deliver(state, sent)
+        silent = batch.task.estimator.update(state, Reception(sent))
         expected = state.prior_mean + gain * (first - mean)
         np.testing.assert_allclose(silent.mean, expected, atol=1e-8)
         loss = gain[:, None] * gain * (variance - second)
@@ -65,15 +66,15 @@ def test_two_silent_sensors_are_the_truncation_by_quadrature() -> None:
     batch = EpisodeBatch.seeded(
         make("report_on_change", (0.6, 0.8, 0.0), **options, **FREE), runs, 0
     )
-    system = batch.task.system
-    sensors, line = system.centre.sensors, np.linspace(-7.0, 7.0, 201)
+    estimator = batch.task.estimator
+    sensors, line = estimator.centre.sensors, np.linspace(-7.0, 7.0, 201)
     grid = np.stack(np.meshgrid(line, line)).reshape(2, -1)
     rows = sensors.measurement_matrix.reshape(-1, 2)[[0, 1, 2, 4]]
     deviations = sensors.deviation.reshape(-1)[[0, 1, 2, 4]]
     for step in range(8):
-        state, sent = batch.state, np.zeros((3, runs), dtype=np.bool_)
+        state, sent = batch.state.estimate, np.zeros((3, runs), dtype=np.bool_)
         sent[2] = step % 3 == 1
-        silent = system.deliver(state, sent)
+        silent = estimator.update(state, Reception(sent))
         for run in range(runs):
             root = np.linalg.cholesky(state.prior_covariance[..., run])
             x = state.prior_mean[:, run, None] + root @ grid
@@ -104,7 +105,7 @@ def test_silence_of_a_lossy_source_is_a_mixture_by_quadrature() -> None:
     batch = EpisodeBatch.seeded(task, 40, 0)
     nodes, weights = np.polynomial.legendre.leggauss(400)
     for step in range(12):
-        state = batch.state
+        state = batch.state.estimate
         mean, deviation = state.prior[0], state.prior_variance[0] ** 0.5
         middle, total = state.held[0], np.zeros((3, 40))
         edges = [mean - 12 * deviation, middle - 1.4, middle + 1.4, mean + 12 * deviation]
@@ -114,8 +115,9 @@ def test_silence_of_a_lossy_source_is_a_mixture_by_quadrature() -> None:
             mass = 0.5 * (high - low) * weights[:, None] * density
             total += [(mass * x**k).sum(0) for k in range(3)]
         first = total[1] / total[0]
-        silent = batch.task.system.deliver(state, np.zeros((1, 40), dtype=np.bool_))
-        np.testing.assert_allclose(silent.estimate[0], first, atol=1e-8)
+        reception = Reception(np.zeros((1, 40), dtype=np.bool_), failure=np.full((1, 40), 0.3))
+        silent = task.estimator.update(state, reception)
+        np.testing.assert_allclose(silent.mean[0], first, atol=1e-8)
         np.testing.assert_allclose(silent.variance[0], total[2] / total[0] - first**2, atol=1e-8)
         batch.step((np.arange(40) % 6 == step % 6)[None])
 
@@ -141,7 +143,7 @@ def test_silence_without_tokens_is_no_information() -> None:
     for batch in batches:
         batch.step(np.ones((2, 4), dtype=np.bool_))  # six tokens, of which one returns
         batch.step(np.zeros((2, 4), dtype=np.bool_))
-    ours, theirs = (batch.delivered for batch in batches)
+    ours, theirs = (batch.delivered.estimate for batch in batches)
     np.testing.assert_allclose(ours.mean, theirs.mean, atol=1e-12)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-12)
 
@@ -174,12 +176,12 @@ def test_denied_requests_leave_the_covariance_honest() -> None:
 def test_the_error_is_that_of_a_particle_filter(threshold: float) -> None:
     """Within 2 %, on the same 150 runs of 60 steps with 1,500 particles each."""
     runs, particles, task = 150, 1500, make(threshold=threshold, **FREE)
-    batch, system = EpisodeBatch.seeded(task, runs, 0), task.system
+    batch, model = EpisodeBatch.seeded(task, runs, 0), task.estimator.model
     rule, rng = fusion_gym.make_policy("send_on_delta", task), np.random.default_rng(0)
-    transition = system.plant.transition[..., 0]
-    factor = np.linalg.cholesky(system.plant.process_covariance[..., 0])
-    deviation = system.centre.sensors.deviation[:, 0, 0]
-    start = batch.state.held[:, 0]  # both states are measured at the start
+    transition = model.transition[..., 0]
+    factor = np.linalg.cholesky(model.process_covariance[..., 0])
+    deviation = task.estimator.centre.sensors.deviation[:, 0, 0]
+    start = batch.state.estimate.held[:, 0]  # both states are measured at the start
     gain = 1.0 / (1.0 + deviation**2)[:, None]
     mean, spread = gain * start, (1.0 - gain[:, 0]) ** 0.5
     cloud = mean[..., None] + spread[:, None, None] * rng.normal(size=(2, runs, particles))
@@ -187,7 +189,8 @@ def test_the_error_is_that_of_a_particle_filter(threshold: float) -> None:
     for _ in range(60):
         noise = np.tensordot(factor, rng.normal(size=cloud.shape), 1)
         cloud = np.tensordot(transition, cloud, 1) + noise
-        held, measurement = batch.state.held[:, 0], batch.state.measurement[:, 0]
+        state = batch.state.estimate
+        held, measurement = state.held[:, 0], state.measurement[:, 0]
         requests = rule(batch.signals())
         batch.step(requests)
         weights = np.ones((runs, particles))
@@ -197,9 +200,9 @@ def test_the_error_is_that_of_a_particle_filter(threshold: float) -> None:
             density = norm.pdf((measurement[s][:, None] - cloud[s]) / deviation[s])
             weights *= np.where(requests[s][:, None], density, high - low)
         weights /= weights.sum(1, keepdims=True)
-        state = batch.delivered
+        state = batch.delivered.estimate
         for place, estimate in enumerate((state.mean, (weights * cloud).sum(-1))):
-            errors[place] += ((state.truth - estimate) ** 2).sum()
+            errors[place] += ((batch.delivered.plant.truth - estimate) ** 2).sum()
         steps = (rng.random((runs, 1)) + np.arange(particles)) / particles
         chosen = [
             np.searchsorted(np.cumsum(w), x).clip(max=particles - 1)

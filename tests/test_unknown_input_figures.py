@@ -39,7 +39,7 @@ POLICIES = {"event": "adaptive_threshold", "random": "random:rate=0.3"}
 @cache
 def run(policy: str, episodes: int = 400, horizon: int = 100, **options: Any) -> Run:
     task = build(horizon=horizon, **options)
-    n = task.system.plant.size
+    n = task.plant.dynamics.size  # type: ignore[attr-defined]
     record = record_run(task, POLICIES.get(policy, policy), episodes, 9000)
     error = np.roll(record.errors, -1, axis=1)  # the fused estimate last
     square = (error**2).mean(0)
@@ -96,9 +96,9 @@ def largest_ratio(errors: Array, covariance: Array) -> Array:
 
 
 def test_bound_holds_under_its_trigger_and_not_without() -> None:
-    system = build().system
-    tables = build(filter="paper").system.nodes.tables.covariance  # type: ignore[attr-defined]
-    assert system.sensor_count == 3
+    task = build(filter="paper")
+    tables = task.estimator.nodes.tables.covariance  # type: ignore[attr-defined]
+    assert task.sensors == 3
     stored = run("event", filter="paper").errors
     broken = run("never", filter="paper").errors
     for time in (1, 2, 5, 20, 60, 100):
@@ -126,7 +126,7 @@ def test_exact_filter_is_unbiased_and_its_covariance_the_actual_one(signal: str)
             continue
         for node in range(3):
             errors = results.errors[time, node]
-            claimed = batch.delivered.estimates.covariance[node, ..., 0]
+            claimed = batch.delivered.estimate.estimates.covariance[node, ..., 0]
             deviation = np.sqrt(np.diag(claimed))
             bias = np.abs(errors.mean(-1)) / (deviation / math.sqrt(1500))
             assert bias.max() < 4.5

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from parts import Parts
 from rules import make_rule
 
 from fusion_gym import linalg
@@ -55,11 +56,11 @@ def test_other_sizes_signals_filters_and_fusions_run(options: dict[str, Any]) ->
         outcome = batch.step(policy(batch.signals()))
         assert np.isfinite(outcome.reward).all()
         assert np.isfinite(batch.observe()).all()
-        mean, covariance = task.system.fused(batch.delivered)
-        assert mean.shape == task.system.truth(batch.delivered).shape
+        mean, covariance = Parts.of(task).fused(batch.delivered)
+        assert mean.shape == task.plant.truth(batch.delivered.plant).shape
         assert np.isfinite(linalg.cholesky(covariance)).all()
-    states = task.system.plant.size + task.system.plant.inputs
-    assert len(task.system.state_names) == states
+    dynamics = task.plant.dynamics  # type: ignore[attr-defined]
+    assert len(task.plant.state_names) == dynamics.size + dynamics.inputs
 
 
 def test_a_users_array_is_the_input() -> None:
@@ -69,7 +70,7 @@ def test_a_users_array_is_the_input() -> None:
     batch.reset()
     for k in range(20):
         batch.step(np.zeros((3, 2), dtype=np.bool_))
-        np.testing.assert_array_equal(batch.delivered.truth[4], np.repeat(values[k], 2))
+        np.testing.assert_array_equal(batch.delivered.plant.truth[4], np.repeat(values[k], 2))
 
 
 # Velocity and elongation: with the force unknown, a common drift of both carts is not seen.
@@ -137,5 +138,5 @@ def test_given_numbers_go_before_the_examples() -> None:
     }
     assert task.settings["initial_covariance"] == [[0.02, 0.0], [0.0, 0.02]]
     assert task.settings["filter"] == "paper"
-    assert task.system.state_names == ("x1", "x2", "d1", "d2")
-    assert build().system.state_names[-1] == "force"
+    assert task.plant.state_names == ("x1", "x2", "d1", "d2")
+    assert build().plant.state_names[-1] == "force"

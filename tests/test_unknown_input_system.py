@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from parts import Parts
 from reference_markov_jump import root
 from scipy.linalg import null_space
 from scipy.special import ndtr
@@ -88,11 +89,11 @@ def reference(
     [("random_walk", None), ("random_walk", 0.05), ("predict", None), ("paper", None)],
 )
 def test_library_and_plain_loop_walk_the_same_trajectories(kind: str, hold: float | None) -> None:
-    system = build(filter=kind, hold_variance=hold, fusion="exact_ci").system
+    system = Parts.of(build(filter=kind, hold_variance=hold, fusion="exact_ci"))
     runs, steps = 3, 100
     draw = np.random.default_rng(8)
-    start = draw.standard_normal((system.start_channels, runs))
-    noise = draw.standard_normal((steps, system.noise_channels, runs))
+    start = draw.standard_normal((system.plant.start_channels, runs))
+    noise = draw.standard_normal((steps, system.plant.noise_channels, runs))
     requests = draw.random((steps, 3, runs)) < 0.4
     state = system.start(start)
     result = []
@@ -100,7 +101,10 @@ def test_library_and_plain_loop_walk_the_same_trajectories(kind: str, hold: floa
         state = system.sense(state, noise[step])
         state = system.deliver(state, requests[step])
         mean, fused = system.fused(state)
-        result.append((system.truth(state), system.local_means(state), state.held, mean, fused))
+        held = state.estimate.held
+        result.append(
+            (system.truth(state), system.estimator.local_means(state.estimate), held, mean, fused)
+        )
     truths, means, helds, fused_means, fused_covariances = (
         np.array(row) for row in zip(*result, strict=True)
     )

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import (
     EpisodeResults,
@@ -153,7 +153,8 @@ class DriftOptions(CommonOptions):
 
 def build(options: DriftOptions) -> Scenario:
     """The scenario of these options."""
-    return Scenario(options, Drift(options.noise))
+    drift = Drift(options.noise)
+    return Scenario(options, drift.plant, drift.estimator)
 
 
 def evaluate() -> tuple[Interval, Interval]:

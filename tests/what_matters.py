@@ -1,7 +1,7 @@
 """Other values of what must not matter to a policy, and what does matter to it.
 
 A policy's copies watch the same episodes, and each is shown other values of what it must not know;
-the network answers to the policy itself. Other values come from the system: the same delivered
+the network answers to the policy itself. Other values come from the plant: the same delivered
 state, moved and measured with other noise.
 """
 
@@ -10,16 +10,17 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from fusion_gym.arrays import merge_runs, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Estimate, MemoryStates
+from fusion_gym.core.beliefs import Beliefs, Estimate
+from fusion_gym.core.knowledge import Knowledge, Signals, covers
 from fusion_gym.core.memory import Memory
-from fusion_gym.core.signals import MEMORY_SIGNALS
-from fusion_gym.core.system import Knowledge, Signals, covers
+from fusion_gym.core.signals import MEMORY_SIGNALS, NETWORK_SIGNALS
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, owner_of
 
@@ -46,7 +47,7 @@ class Believed:
         """All that a policy may ask of beliefs, over so many steps."""
         values = {name: getattr(beliefs, name) for name in cls.parts}
         made_of = {
-            name: getattr(beliefs, name) for name in cls.states if beliefs.task.memory_system
+            name: getattr(beliefs, name) for name in cls.states if beliefs.task.memory_estimator
         }
         return cls(values | {"value": beliefs.value(steps), "loss": beliefs.loss(steps)}, made_of)
 
@@ -65,7 +66,7 @@ class Believed:
         if name in self.parts:
             return self.values[name]
         if name in self.states:
-            return self.made_of.get(name, MemoryStates())
+            return self.made_of.get(name, {})
         raise AttributeError(name)
 
     def value(self, steps: int = 1) -> Any:
@@ -104,42 +105,40 @@ def moved_otherwise(
     """
     if batch.delivered is None:
         return batch
-    noise = rng.standard_normal((batch.task.system.noise_channels, batch.num_envs))
-    memory_posterior.sense(noise)
-    return with_states(batch, batch.task.system.sense(batch.delivered, noise), memory_posterior)
+    task, before = batch.task, batch.delivered
+    noise = rng.standard_normal((task.plant.noise_channels, batch.num_envs))
+    plant = task.plant.sense(before.plant, noise)
+    measurement = task.plant.measurement(plant)
+    memory_posterior.observe(measurement)
+    estimate = task.estimator.observe(task.estimator.predict(before.estimate), measurement)
+    state = batch.state._replace(plant=plant, estimate=estimate)
+    return with_states(batch, state, memory_posterior)
 
 
 def forgotten(batch: EpisodeBatch) -> EpisodeBatch:
     """Without what was measured and not sent."""
     states = batch.memory.states
-    memory = Memory(dataclasses.replace(batch.task, memory_system=None), batch.memory.owner)
-    states = None if states is None else MemoryStates(single=states.single)
+    memory = Memory(dataclasses.replace(batch.task, memory_estimator=None), batch.memory.owner)
+    states = {name: state for name, state in states.items() if name == "single"}
     return with_states(batch, batch.state, memory.with_states(states))
 
 
 def with_other_truth(batch: EpisodeBatch, rng: np.random.Generator) -> EpisodeBatch:
-    """All that the system's visible state hides is changed: the truth, coming losses."""
-    system, states = batch.task.system, batch.memory.states
-    if states is not None:
-        memory_system = batch.task.memory_system
-        states = MemoryStates(
-            tampered(memory_system, states.every, rng),
-            tampered(memory_system, states.own, rng),
-            tampered(system, states.single, rng),
-        )
-    state = tampered(system, batch.state, rng)
-    return with_states(batch, state, batch.memory.with_states(states))
+    """The truth behind the measurements is changed, and so are coming losses."""
+    state = batch.state
+    kept = batch.task.plant.measurement(state.plant)
+    plant = differing(state.plant, rng, lambda name, value: np.shares_memory(value, kept))
+    hidden = ("following", "lost", "delay")
+    network = differing(state.network, rng, lambda name, value: name not in hidden)
+    return with_states(batch, state._replace(plant=plant, network=network), batch.memory)
 
 
-def tampered(system: Any, state: Any, rng: np.random.Generator) -> Any:
-    """A state with other values of what the visible one hides."""
-    if state is None:
-        return None
-    visible = system.visible(state)
+def differing(state: Any, rng: np.random.Generator, kept: Callable[[str, Any], bool]) -> Any:
+    """A state with other values of what is not kept."""
     changed = {}
     for field in dataclasses.fields(state):
         value = getattr(state, field.name)
-        if value is None or value is getattr(visible, field.name):
+        if value is None or kept(field.name, value):
             continue
         if value.dtype == np.bool_:
             changed[field.name] = ~value
@@ -148,7 +147,6 @@ def tampered(system: Any, state: Any, rng: np.random.Generator) -> Any:
             changed[field.name] = value * np.exp(other) if (value > 0.0).all() else value + other
         else:
             changed[field.name] = np.roll(value, 1, axis=-1)
-    assert changed
     return dataclasses.replace(state, **changed)
 
 
@@ -156,7 +154,7 @@ def other_runs(values: Values, rng: np.random.Generator) -> Values:
     """Every value is another run's, numbers moved besides."""
     result = {}
     for name, value in values.items():
-        if name == "model":
+        if name == "estimate":
             result[name] = value
             continue
         if isinstance(value, Believed):
@@ -173,9 +171,8 @@ def other_runs(values: Values, rng: np.random.Generator) -> Values:
 
 def of_sensor(sensor: int, true: Values, other: Values, batch: EpisodeBatch) -> Values:
     """``true`` where the sensor knows it by itself or everyone is told, ``other`` elsewhere."""
-    own = [signal for signal in MEMORY_SIGNALS if signal.knowledge == "own_memory"]
-    signals = (*batch.task.system.signals, *own)
-    declared = {signal.name: signal.axes for signal in signals if signal.name in true}
+    signals = (*batch.task.estimator.signals, *MEMORY_SIGNALS, *NETWORK_SIGNALS)
+    own = {signal.name for signal in signals if signal.known_to("own_memory")}
 
     def with_own(all_other: Any, all_true: Any) -> Any:
         result = all_other.copy()
@@ -184,7 +181,7 @@ def of_sensor(sensor: int, true: Values, other: Values, batch: EpisodeBatch) -> 
 
     result = {name: true[name] if name in TOLD else other[name] for name in true}
     for name, value in true.items():
-        if name in OWN_ROW or declared.get(name, "").startswith("(sensors"):
+        if name in OWN_ROW or name in own:
             result[name] = with_own(result[name], value)
         elif name == "own_beliefs":
             result[name] = other[name].with_each(with_own, value)
@@ -208,7 +205,7 @@ def in_runs(runs: np.ndarray[Any, Any], true: Values, other: Values) -> Values:
                     what: merge_runs(stored, take_runs(other[name].made_of[what], runs), runs)
                     for what, stored in value.made_of.items()
                 }
-        elif name == "model":
+        elif name == "estimate":
             result[name] = merge_runs(value, take_runs(other[name], runs), runs)
         elif name not in CLOCK:
             result[name] = merge_runs(value, other[name][..., runs], runs)
@@ -276,11 +273,13 @@ def what_matters(policy: Policy, task: Task) -> set[str]:
         for sensor, each in enumerate(single):
             answer = each(Signals(of_sensor(sensor, true, foreign, batch)))
             compare(OTHERS, answer[sensor], requests[sensor])
-        if task.memory_system is not None:
+        if task.memory_estimator is not None:
             compare(PAST, copy.deepcopy(without_memory)(forgotten(batch).signals()), requests)
         memory_posterior, state = batch.memory.branch(None, batch.num_envs), batch.state
+        beliefs = partial(memory_posterior.beliefs, state.estimate, batch.arrival_probability())
         granted = batch.step(requests).granted
-        memory_posterior.deliver(state, batch.delivered, granted)
+        delivery = task.network.deliver(state.network, granted)[1]
+        memory_posterior.update(beliefs, delivery.reception.arrived)
         if step % 2 == 0:
             compare(PAST, without_memory(signals), requests)
         else:

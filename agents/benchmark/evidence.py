@@ -39,7 +39,7 @@ from agents.benchmark.verdict import (
     mean_difference,
     run_test,
 )
-from fusion_gym.core.system import covers
+from fusion_gym.core.knowledge import covers
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 

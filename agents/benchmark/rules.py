@@ -21,8 +21,8 @@ from agents.benchmark.settings import (
     knowledge_of,
 )
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import covers
 from fusion_gym.core.scale import prices_at
-from fusion_gym.core.system import covers
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.policy_batch import run_policies
 from fusion_gym.evaluation.rule_search import (

@@ -5,7 +5,7 @@ from typing import Any, Literal, get_args
 
 import pydantic
 
-from fusion_gym.core.system import Knowledge
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.rule_search import ClassName

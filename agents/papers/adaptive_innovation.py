@@ -35,7 +35,7 @@ from agents.papers.paper import (
     policy_of,
 )
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.output import palette
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions

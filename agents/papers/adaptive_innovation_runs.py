@@ -13,11 +13,11 @@ from agents.papers.paper import Settings
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.runs import Outcome
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
+from fusion_gym.core.runs import Outcome, State
 from fusion_gym.policies.base import decide
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
-from fusion_gym.systems.correlated.system import CorrelatedTrackingState, CorrelatedTrackingSystem
+from fusion_gym.systems.correlated.system import CorrelatedTrackingPlant, CorrelatedTrackingTruth
 
 STEPS = 600
 SENSORS = ("sensor 1", "sensor 2", "sensor 3")
@@ -41,8 +41,8 @@ class Lane(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SideBySide(CorrelatedTrackingSystem):
-    """The system with a noise scale for each run (N,), and runs that begin at the mean (N,)."""
+class SideBySide(CorrelatedTrackingPlant):
+    """The plant with a noise scale for each run (N,), and runs that begin at the mean (N,)."""
 
     scales: Array
     known_start: NDArray[np.bool_]
@@ -50,18 +50,18 @@ class SideBySide(CorrelatedTrackingSystem):
     def _scale(self, noise: Array) -> Array:
         return self.scales
 
-    def start(self, noise: Array) -> CorrelatedTrackingState:
+    def start(self, noise: Array) -> tuple[CorrelatedTrackingTruth, None]:
         """Return time 0, with x(0) at its mean in some runs."""
-        state = super().start(noise)
-        truth = np.where(self.known_start, state.mean[0], state.truth)
-        return replace(state, truth=truth)
+        state, announcement = super().start(noise)
+        truth = np.where(self.known_start, self.dynamics.initial_mean, state.truth)
+        return replace(state, truth=truth), announcement
 
 
 class Step(NamedTuple):
     """A step of all lanes: ``state`` after the delivery, ``outcome`` the network's answer."""
 
     number: int
-    state: CorrelatedTrackingState
+    state: State
     outcome: Outcome
     innovation: Array  # (sensors, N)
 
@@ -73,11 +73,11 @@ def steps(
     lanes = list(lanes)
     options = {"horizon": STEPS} | settings["options"] | options
     task = fusion_gym.make_task(CorrelatedTrackingOptions(**options))
-    system = SideBySide(
-        **vars(task.system), scales=np.repeat([lane.scale for lane in lanes], episodes),
+    plant = SideBySide(
+        **vars(task.plant), scales=np.repeat([lane.scale for lane in lanes], episodes),
         known_start=np.repeat([lane.known_start for lane in lanes], episodes),
     )  # fmt: skip
-    batch = EpisodeBatch(replace(task, system=system), len(lanes) * episodes)
+    batch = EpisodeBatch(replace(task, plant=plant), len(lanes) * episodes)
     runs = np.arange(batch.num_envs)
     batch.seed(runs, (seed + runs % episodes).tolist())
     batch.reset()
@@ -141,51 +141,50 @@ class ErrorRecord:
 
     def add(self, step: Step) -> None:
         """Add a step."""
-        state = step.state
-        assert state.joint is not None
-        claimed, actual = state.covariance[0], state.joint[0, 0]
-        error = state.truth - state.mean[0]
+        truth, estimate = step.state.plant.truth, step.state.estimate
+        joint = step.state.plant.scale * estimate.joint
+        claimed, actual = estimate.covariances[0], joint[0, 0]
+        error = truth - estimate.means[0]
         deviation = np.sqrt(linalg.diagonal(actual))
         bound = np.sqrt(linalg.diagonal(claimed))
         mse, traces = (error**2).sum(0), (linalg.trace(actual), linalg.trace(claimed))
         largest = _largest(actual, claimed)
-        start = state.truth - np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
+        start = truth - np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
         self._add(
             mse=mse, actual=traces[0], conservative=traces[1],
             inside=np.abs(error) <= 3.0 * deviation, ordered=deviation <= bound * (1.0 + _ROUNDING),
             bounded=largest <= 1.0 + _ROUNDING, whitened=_whitened(error, claimed), square=error**2,
-            level=start**2, beats=traces[1] <= linalg.trace(state.covariance[1:]),
+            level=start**2, beats=traces[1] <= linalg.trace(estimate.covariances[1:]),
         )  # fmt: skip
         self._most(worst=largest)
         for name, value in zip(("mse", "actual", "conservative"), (mse, *traces), strict=True):
             self.rows[f"{name}_steps"].append(self._lanes(value).mean(-1))
         first = {
-            "truth": state.truth, "mean": state.mean[0], "actual_deviation": deviation,
+            "truth": truth, "mean": estimate.means[0], "actual_deviation": deviation,
             "conservative_deviation": bound,
         }  # fmt: skip
         for name, value in first.items():
             self.rows[name].append(self._lanes(value)[..., 0])
         if self.with_nodes:
-            self._add(node_mse=((state.truth - state.mean[1:]) ** 2).sum(1))
+            self._add(node_mse=((truth - estimate.means[1:]) ** 2).sum(1))
         if step.number % _EVERY == 0:
             self._compare(step)
         if step.number + 1 == ELLIPSES:
             own = np.arange(len(SENSORS) + 1)
-            both = np.stack((state.covariance, state.joint[own, own]))
+            both = np.stack((estimate.covariances, joint[own, own]))
             self.stored["ellipses"] = self._lanes(both)[..., 0]
 
     def _compare(self, step: Step) -> None:
-        state = step.state
-        assert state.joint is not None
+        estimate = step.state.estimate
         self.compared += 1
-        nodes, fused = state.covariance[1:], state.covariance[:1]
+        nodes, fused = estimate.covariances[1:], estimate.covariances[:1]
         self._add(
             encloses=_largest(fused, nodes) <= 1.0 + _ROUNDING,
             encloses_plane=_largest(fused[:, :2, :2], nodes[:, :2, :2]) <= 1.0 + _ROUNDING,
         )
         if self.with_nodes:
             own = np.arange(1, len(SENSORS) + 1)
-            actual = state.joint[own, own]
+            actual = step.state.plant.scale * estimate.joint[own, own]
             self._add(node_bounded=_largest(actual, nodes) <= 1.0 + _ROUNDING)
             gap = np.abs(nodes - actual).max((1, 2)) / np.abs(nodes).max((1, 2))
             self._most(node_gap=gap)

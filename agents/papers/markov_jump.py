@@ -98,12 +98,13 @@ class Run(NamedTuple):
 def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
     """Run episodes with consecutive seeds from ``seed``."""
     rows: list[tuple[Any, ...]] = []
+    plant, estimator = task.plant, task.estimator
     for batch, requests in walk(task, policy, episodes, seed):
-        outcome, state = batch.step(requests), batch.delivered
-        mean, covariance = task.system.fused(state)
-        truth = task.system.truth(state)
-        local = task.system.local_means(state) if hasattr(state, "node_mean") else mean[None]
-        trace = np.trace(covariance)[:1]
+        truth, outcome = plant.truth(batch.state.plant), batch.step(requests)
+        estimate = batch.delivered.estimate
+        mean, nodes = estimator.mean(estimate), hasattr(estimate, "node_mean")
+        local = estimator.local_means(estimate) if nodes else mean[None]
+        trace = np.trace(estimator.covariance(estimate))[:1]
         rows.append((truth, mean, truth - local, outcome.granted[:, 0], trace))
     truth, mean, local, sent, trace = (np.array(row) for row in zip(*rows, strict=True))
     return Run(truth, mean, local, sent, trace[:, 0])
@@ -117,17 +118,20 @@ def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
     lanes, options = _lanes(settings), settings["options"]
     task = example(**({"horizon": _LONG} | options))
     short = example(**({"horizon": _SHOWN} | options))
-    system: Any = task.system
+    plant: Any = task.plant
+    estimator: Any = task.estimator
     runs = [run_markov_jump(task, policy, episodes, seed) for policy in lanes.values()]
-    local = system.recursion.local_trace[:, system.filters.at(np.arange(1, task.horizon + 1))]
-    cycle = system.filters.period
-    gaps = local[:, -cycle:] - system.full_rate_traces().mean()
+    place = estimator.filters.at(np.arange(1, task.horizon + 1))
+    local = estimator.recursion.local_trace[:, place]
+    cycle = estimator.filters.period
+    gaps = local[:, -cycle:] - estimator.full_rate_traces().mean()
     limits = [float(gaps.min()), float(gaps.max())]
     at_ends = [
         run_markov_jump(short, trigger(m, literal=True), episodes, seed).sent[-2 * cycle :].mean()
         for m in (limits[0] - _MARGIN, limits[1] + _MARGIN)
     ]
-    sensors, plant = system.sensors, system.plant
+    sensors, dynamics = plant.sensors, plant.dynamics
+    transitions = np.moveaxis(dynamics.transition, -1, 0)
     mean = (sensors.fading_values * sensors.fading_probabilities).sum(1)
     square = (sensors.fading_values**2 * sensors.fading_probabilities).sum(1)
     return {
@@ -137,8 +141,8 @@ def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
         "literal": run_markov_jump(short, trigger(0.0, literal=True), episodes, seed).sent,
         "local": local, "periods": sensors.period[:, 0], "range": limits,
         "at_ends": [float(share) for share in at_ends],
-        "radii": np.abs(np.linalg.eigvals(np.moveaxis(plant.transition, -1, 0))).max(-1).tolist(),
-        "square_radius": float(plant.second_moment_radius()), "mean of β": mean,
+        "radii": np.abs(np.linalg.eigvals(transitions)).max(-1).tolist(),
+        "square_radius": float(dynamics.second_moment_radius()), "mean of β": mean,
         "variance of β": square - mean**2,
     }  # fmt: skip
 
@@ -219,7 +223,7 @@ def _summarise_tracking(data: Data) -> Data:
 def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
     """Return actual and claimed covariances of nodes and centre; the first threshold must be 0."""
     task = example()
-    system: Any = task.system
+    estimator: Any = task.estimator
     time = np.arange(1, task.horizon + 1)
     fused, traces, least = [], [], []
     first: Data = {}
@@ -228,28 +232,28 @@ def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
         fused.append(run.squared.sum(1).mean(0))
         traces.append(float(run.trace.mean()))
         if not first:
-            exact = _exact(system, task.horizon)
-            gaps = [covariances(system, run.sent, swapped) - exact for swapped in (True, False)]
+            exact = _exact(estimator, task.horizon)
+            gaps = [covariances(estimator, run.sent, swapped) - exact for swapped in (True, False)]
             first = {
                 "local": np.square(run.local_error).sum(2).mean(0),
                 "moment": np.square(run.truth).sum(1).mean(0),
                 "difference": [float(np.abs(gap).max() / np.abs(exact).max()) for gap in gaps],
             }
-        sigma = covariances(system, run.sent, swapped=True)
+        sigma = covariances(estimator, run.sent, swapped=True)
         least.append(float(np.linalg.eigvalsh((sigma + np.swapaxes(sigma, 1, 2)) / 2.0).min()))
     references = run_markov_jump(example(fusion="ci"), trigger(0.0), episodes, seed)
-    _, squares = system.model.state_moments(task.horizon)
+    _, squares = estimator.model.state_moments(task.horizon)
     return first | {
         "m": list(settings["m"]),
-        "claimed": system.recursion.local_trace[:, system.filters.at(time)].mean(-1),
+        "claimed": estimator.recursion.local_trace[:, estimator.filters.at(time)].mean(-1),
         "fused": np.array(fused), "traces": traces, "least": least,
         "moment_claimed": float(squares[1:].sum(1).mean()), "ci": references.squared.sum(1).mean(0),
     }  # fmt: skip
 
 
-def _exact(system: Any, horizon: int) -> Array:
+def _exact(estimator: Any, horizon: int) -> Array:
     """Return joint covariances (H + 1, l n, l n) of the nodes' errors from the library."""
-    joint = system.recursion.local[..., system.filters.at(np.arange(horizon + 1))]
+    joint = estimator.recursion.local[..., estimator.filters.at(np.arange(horizon + 1))]
     size = joint.shape[0] * joint.shape[2]
     return np.ascontiguousarray(joint.transpose(4, 0, 2, 1, 3)).reshape(horizon + 1, size, size)
 

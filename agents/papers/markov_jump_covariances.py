@@ -13,23 +13,23 @@ from numpy.typing import NDArray
 from fusion_gym.arrays import Array
 
 
-def covariances(system: Any, sent: NDArray[np.bool_], swapped: bool) -> Array:
+def covariances(estimator: Any, sent: NDArray[np.bool_], swapped: bool) -> Array:
     """Return Σ(k) (H + 1, l n, l n) at k = 0..H; ``sent`` (H, l) are the transmissions at k = 1..H.
 
     Its entries are the sums (45) and (51) over the modes. ``swapped`` uses the third term of (46)
     as printed, with the indices i and j of the first; otherwise it is the transposed second term of
     the pair (j, i), which its derivation implies.
     """
-    joint, states = np.array(_joint(system, sent, swapped)), system.plant.size
+    joint, states = np.array(_joint(estimator, sent, swapped)), estimator.model.plant.size
     times, count, _, size, _ = joint.shape
     modes = size // states
     blocks = joint.reshape(times, count, count, modes, states, modes, states).sum((3, 5))
     return blocks.transpose(0, 1, 3, 2, 4).reshape(times, count * states, count * states)
 
 
-def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
+def _joint(estimator: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
     """Return P_ij (l, l, a, a) of the copies at k = 0..H."""
-    filters, model = system.filters, system.model
+    filters, model = estimator.filters, estimator.model
     moved, faded = model.transition, model.faded
     shared = model.sensors.noise_coupling[..., 0] @ model.plant.noise_covariance  # S_wv
     noise = shared @ model.sensors.noise_coupling[..., 0].T  # R_ij, i != j
@@ -59,7 +59,7 @@ def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
                 a, b = float(everyone[time, i]), float(everyone[time, j])
                 if i == j:  # Theorem 2, with (12)-(22) where the node was sent
                     filtered[i, i] = exact[i, i] if a else ahead
-                    observed = _prior(system, place, i) @ faded[i]
+                    observed = _prior(estimator, place, i) @ faded[i]
                     crossed[i, i] = -a * np.outer(observed, own[i])
                     variance = filters.innovation_covariance[i, i, place]
                     noises[i, i] = model.plant.noise_covariance - a * variance * np.outer(
@@ -85,10 +85,8 @@ def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
     return result
 
 
-def _prior(system: Any, place: int, node: int) -> Array:
+def _prior(estimator: Any, place: int, node: int) -> Array:
     """Return P_i(k|k-1) from (19): P(k|k) = (I - K c) P(k|k-1), equal without a sample."""
-    filters = system.filters
-    keep = np.eye(system.model.size) - np.outer(
-        filters.gain[node, :, place], system.model.faded[node]
-    )
+    filters, model = estimator.filters, estimator.model
+    keep = np.eye(model.size) - np.outer(filters.gain[node, :, place], model.faded[node])
     return np.asarray(np.linalg.solve(keep, filters.covariance[node, node, ..., place]))

@@ -15,7 +15,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.centre import FederatedCentre
 from fusion_gym.systems.tobit.filters import Expectation
-from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.system import CensoredEstimator
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
@@ -28,10 +28,10 @@ _MOST = 0.5  # share of the points
 FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
 
 
-def censored(task: Task) -> CensoredSystem:
-    """Return the task's system with its type."""
-    assert isinstance(task.system, CensoredSystem)
-    return task.system
+def censored(task: Task) -> CensoredEstimator:
+    """Return the task's estimator with its type."""
+    assert isinstance(task.estimator, CensoredEstimator)
+    return task.estimator
 
 
 def squares(task: Task, policy: Policy | str, episodes: int, seed: int) -> Array:
@@ -48,7 +48,8 @@ def node_squares(task: Task, policy: Policy | str, episodes: int, seed: int) -> 
     local = np.empty((episodes, task.horizon, task.sensors, STATES))
     for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
         fused[runs, step] = batch.step(requests).squared_error.T
-        error = task.system.truth(batch.delivered) - task.system.local_means(batch.delivered)
+        truth = task.plant.truth(batch.delivered.plant)
+        error = truth - task.estimator.local_means(batch.delivered.estimate)
         local[runs, step] = (error**2).transpose(2, 0, 1)
     return fused, local
 
@@ -58,7 +59,7 @@ def held_values(task: Task, policy: str, seed: int) -> Array:
     rows: list[Array] = []
     for batch, requests in walk(task, policy, 1, seed):
         batch.step(requests)
-        rows.append(batch.delivered.held[:, 0, 0].copy())
+        rows.append(batch.delivered.estimate.held[:, 0, 0].copy())
     return np.array(rows)
 
 
@@ -139,11 +140,11 @@ def floor(env: str, **options: Any) -> list[float]:
     matrices.
     """
     task = fusion_gym.make_task(env, filter="kalman", **(FREE | options))
-    policy = "always" if task.access == "any" else "round_robin"
+    policy = "always" if task.network.access == "any" else "round_robin"
     deviations = []
     for batch, requests in walk(task, policy, 1, 0):
         batch.step(requests)
-        covariance = task.system.fused(batch.delivered)[1]
+        covariance = task.estimator.covariance(batch.delivered.estimate)
         deviations.append(np.sqrt(np.diagonal(covariance[..., 0])))
     return [float(value) for value in np.array(deviations).mean(0)]
 
@@ -235,8 +236,9 @@ def reading_task(reading: str, **options: Any) -> Task:
     task = fusion_gym.make_task(OSCILLATOR, **(dict(changed) | options))
     if not printed:
         return task
-    system = censored(task)
-    centre = system.centre
+    estimator = censored(task)
+    centre = estimator.centre
     assert isinstance(centre, FederatedCentre)
     filter_ = PrintedTobitFilter(centre.sensors, printed)
-    return replace(task, system=replace(system, centre=replace(centre, filter=filter_)))
+    centre = replace(centre, filter=filter_)
+    return replace(task, estimator=replace(estimator, centre=centre))

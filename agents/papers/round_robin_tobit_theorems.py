@@ -98,7 +98,7 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
     last = np.zeros((episodes, 3))
 
     for step, runs, batch, requests in walk_in_parts(task, "round_robin", episodes, seed):
-        error = batch.state.truth - batch.state.prior_mean
+        error = batch.state.plant.truth - batch.state.estimate.prior_mean
         if step:
             earlier = last[runs].T
             values["product"][runs] += error[2] * earlier[2]
@@ -116,8 +116,9 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
         values["surprised"][runs] += sure & free
         outcome = batch.step(requests)
         assert np.all(np.argmax(outcome.granted, axis=0) == sensor)
-        mean, covariance = task.system.fused(batch.delivered)
-        error = task.system.truth(batch.delivered) - mean
+        truth, estimate, *_ = batch.delivered
+        error = task.plant.truth(truth) - task.estimator.mean(estimate)
+        covariance = task.estimator.covariance(estimate)
         values["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
     for name in ("nees", "predicted", "uncensored"):
         values[name] /= task.horizon
@@ -141,7 +142,7 @@ def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> 
     values = np.empty((task.horizon, 3, episodes))
     for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
         batch.step(requests)
-        values[step, :, runs] = task.system.fused(batch.delivered)[0]
+        values[step, :, runs] = task.estimator.mean(batch.delivered.estimate)
     return values
 
 
@@ -197,12 +198,12 @@ class MatrixBound:
 
     def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
         """Move to the next step, given P⁻, the prediction, and whether this sensor has its turn."""
-        system = censored(self.task)
+        model = censored(self.task).model
         stored, share = (self._updated_upper if self.upper else self._updated_lower)(
             covariance, observed, turn
         )
-        process = system.model.process_covariance * self.inflation
-        self.value = linalg.congruence(system.model.transition, stored) + share * process
+        process = model.process_covariance * self.inflation
+        self.value = linalg.congruence(model.transition, stored) + share * process
 
     def _updated_upper(
         self, covariance: Array, observed: Censoring, turn: bool
@@ -238,7 +239,7 @@ def failures(
     local, fused = np.zeros((len(bounds), episodes)), np.zeros((len(pairs), episodes))
 
     for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
-        covariance = batch.state.prior_covariance
+        covariance = batch.state.estimate.prior_covariance
         observed = [_prediction(task, batch, sensor) for sensor in range(task.sensors)]
         for place, bound in enumerate(bounds):
             own = covariance * bound.inflation
@@ -266,7 +267,8 @@ def _bounds(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]
 
 
 def _prediction(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
-    sensors, expected = censored(task).centre.sensors, batch.state.prediction.expectation
+    sensors = censored(task).centre.sensors
+    expected = batch.state.estimate.prediction.expectation
     limit, deviation = sensors.threshold[sensor, 0], sensors.deviation[sensor, 0]
     low = (limit - expected.latent[sensor, 0]) / deviation
     hazard = gaussian.hazard(low)

@@ -51,7 +51,7 @@ def _record(episodes: int, seed: int, settings: Settings, **options: Any) -> His
 
 def simulate_network(episodes: int, seed: int, settings: Settings) -> Data:
     """Return tokens, events, grants, and the measurements before and after the protocol."""
-    bucket = scheme(**settings["options"]).bucket
+    bucket = scheme(**settings["options"]).network.bucket
     result = _record(episodes, seed, settings)
     free = _record(episodes, seed, settings, tokens="unlimited")
     costs = bucket.cost[:, 0]

@@ -88,20 +88,20 @@ def single_sensor(sensor: int) -> Task:
 
 def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = TRIGGER) -> History:
     """Run the paper's trigger, or another policy, and record every step."""
-    system: Any = task.system
-    rows, share = [], system.centre.feedback.share[:, None, None]
+    estimator: Any = task.estimator
+    rows, share = [], estimator.centre.feedback.share[:, None, None]
     for batch, requests in walk(task, policy, episodes, seed):
-        before, tokens = batch.state, batch.tokens
+        before, tokens = batch.state.estimate, batch.tokens
         outcome = batch.step(requests)
-        state, granted = batch.delivered, outcome.granted
+        (truth, state, *_), granted = batch.delivered, outcome.granted
         expected, _, root, planned = state.prediction[:4]
-        local = system.local_means(state)
+        local = estimator.local_means(state)
         bound = np.full((*local.shape[:2], *state.covariance.shape[1:]), np.nan)
         if planned is not None:
             bounds = (planned.delivered_covariance, planned.silent_covariance)
             bound = linalg.congruence(root, np.where(granted[:, None, None], *bounds) / share)
         values = (
-            state.truth, state.measurement, state.held, before.held, outcome.requested, granted,
+            truth.truth, state.measurement, state.held, before.held, outcome.requested, granted,
             batch.tokens, tokens, state.prior_mean, state.prior_covariance,
             expected.uncensored_probability, expected.hazard, local, bound, state.mean,
             state.covariance,
@@ -154,8 +154,8 @@ class Terms(NamedTuple):
 
 def terms(task: Task, history: History) -> Terms:
     """Return the terms of (30) in every recorded step of the paper's filter, thresholds zero."""
-    system: Any = task.system
-    centre = system.centre
+    estimator: Any = task.estimator
+    centre = estimator.centre
     sensors, constants = centre.sensors, centre.filter.constants
     k1, k2, k3, k4, k5, k6, _, _ = constants.kappa
     grow, shift = constants.second_moment

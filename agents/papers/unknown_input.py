@@ -23,7 +23,7 @@ from fusion_gym.output import palette
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
 from fusion_gym.systems.unknown_input.nodes import TableNodes
-from fusion_gym.systems.unknown_input.system import UnknownInputSystem
+from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 
 PRINTED, CARTS = "paper", "two_carts"
 EXAMPLES = (PRINTED, CARTS)
@@ -67,22 +67,23 @@ class Record(NamedTuple):
         return self.truth[:, None] - every
 
 
-def make_example(**options: Any) -> tuple[Task, UnknownInputSystem]:
-    """Return the task of these options with its system."""
+def make_example(**options: Any) -> tuple[Task, DrivenPlant]:
+    """Return the task of these options with its plant."""
     task = fusion_gym.make_task(UnknownInputOptions(**({"horizon": 100} | options)))
-    assert isinstance(task.system, UnknownInputSystem)
-    return task, task.system
+    plant = task.plant
+    assert isinstance(plant, DrivenPlant)
+    return task, plant
 
 
 def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
     """Run a policy and record the data of the figures."""
     rows = []
     for batch, requests in walk(task, policy, episodes, seed):
-        apart = batch.state.measurement - batch.state.held
-        outcome, state = batch.step(requests), batch.delivered
-        means = state.estimates.mean, state.estimates.fused_mean
-        values = (state.truth, *means, state.held, (apart**2).sum(1), outcome.granted)
-        rows.append([np.array(value) for value in values])
+        apart = batch.state.estimate.measurement - batch.state.estimate.held
+        outcome, estimate = batch.step(requests), batch.delivered.estimate
+        truth, means = batch.delivered.plant.truth, estimate.estimates
+        values = (truth, means.mean, means.fused_mean, estimate.held, (apart**2).sum(1))
+        rows.append([np.array(value) for value in (*values, outcome.granted)])
     return Record(*map(np.array, zip(*rows, strict=True)))
 
 
@@ -130,22 +131,22 @@ def _example(
         options = {"example": example} | options | settings["options"]
         if name == WALK:
             options |= _HOLD.get(example, {})
-        task, system = make_example(**options)
+        task, plant = make_example(**options)
         rule = fusion_gym.make_policy(settings["policy"], task)
         assert isinstance(rule, AdaptiveThreshold)
         if name == FIXED:
-            task, system = make_example(**(options | {"rho_initial": rule.rho_bar}))
+            task, plant = make_example(**(options | {"rho_initial": rule.rho_bar}))
         record = record_run(task, policy, episodes, seed)
-        mse.append(halves((record.errors[:, 0] ** 2).mean(0), system.plant.size, 0))
+        mse.append(halves((record.errors[:, 0] ** 2).mean(0), plant.dynamics.size, 0))
         rates.append(record.granted.mean(0))
         if name == OURS:
-            data |= _under_the_trigger(system, rule, record)
+            data |= _under_the_trigger(task, rule, record)
         if name == WALK:
             data["walk"] = record.fused[..., 0]
     return data | {"mse": np.array(mse), "rates": np.array(rates)}
 
 
-def _under_the_trigger(system: UnknownInputSystem, rule: AdaptiveThreshold, record: Record) -> Data:
+def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> Data:
     """Return the data of the paper's figures, and the ratio of errors to bounds.
 
     Estimates are the fused one, then the nodes'. ``truth`` (H, s), ``local`` (H, l, s), ``fused``
@@ -157,7 +158,9 @@ def _under_the_trigger(system: UnknownInputSystem, rule: AdaptiveThreshold, reco
     thresholds and their extremes over ρ₀ and ρ̄; ``settled`` (E,) the number of updates until every
     threshold is at 99 % of ρ̄.
     """
-    nodes = system.nodes
+    estimator = task.estimator
+    assert isinstance(estimator, UnknownInputEstimator)
+    nodes = estimator.nodes
     assert isinstance(nodes, TableNodes)
     n, errors = nodes.model.size, record.errors
     bounds = np.concatenate((nodes.fused[None], nodes.tables.covariance))[..., 1:]
@@ -266,13 +269,13 @@ def _recursion(
     **options: Any,
 ) -> tuple[Record, list[dict[str, Array]]]:
     """Return a run, and the printed filter of each node on the trigger's deliveries."""
-    task, system = make_example(example=example, filter="paper", **options)
+    task, plant = make_example(example=example, filter="paper", **options)
     usual = make_example(example=example, filter="paper")[0]
     rho_bar = options.get("rho_bar", float(np.max(usual.policy_defaults[TRIGGER]["rho_bar"])))
     record = record_run(task, policy, episodes, seed)
     return record, [
         recursion.run(model, record.held[:, i], record.granted[:, i], cutoff)
-        for i, model in enumerate(recursion.models(system, _FACTOR[example], rho_bar))
+        for i, model in enumerate(recursion.models(plant, _FACTOR[example], rho_bar))
     ]
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from fusion_gym.arrays import Array
-from fusion_gym.systems.unknown_input.system import UnknownInputSystem
+from fusion_gym.systems.unknown_input.system import DrivenPlant
 
 # I - C ℬ L in (20) is a projection, its singular values are 0 or at least 1: what lies between is
 # rounding, and half a 1 tells one from the other.
@@ -42,12 +42,11 @@ class Model(NamedTuple):
     covariance: Array
 
 
-def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Model]:
+def models(plant: DrivenPlant, factor: float, rho_bar: float) -> list[Model]:
     """Return the model of every node."""
-    model, sensors, plant = system.nodes.model, system.nodes.sensors, system.plant
-    n = plant.size
-    lifted = (plant.transition, plant.input_matrix, plant.process_covariance)
-    start = (model.initial_mean[:n, 0], model.initial_covariance[:n, :n, 0])
+    dynamics, sensors = plant.dynamics, plant.sensors
+    lifted = (dynamics.transition, dynamics.input_matrix, dynamics.process_covariance)
+    start = (dynamics.initial_mean[:, 0], dynamics.initial_covariance[..., 0])
     measured = zip(sensors.measurement_matrix[..., 0], sensors.covariance[..., 0], strict=True)
     a, b, w = (matrix[..., 0] for matrix in lifted)
     return [Model(a, b, w, c, v, factor, rho_bar, *start) for c, v in measured]
@@ -124,16 +123,16 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
 _TRACES = ("state_bound", "best_bound")
 
 
-def decoupling(paper: UnknownInputSystem, every_step: UnknownInputSystem) -> dict[str, Any]:
+def decoupling(paper: DrivenPlant, every_step: DrivenPlant) -> dict[str, Any]:
     """Return rank and columns of C ℬ with ℬ as (3) prints it, for a = 2, and error bounds.
 
     ``conditions`` are the condition numbers of the C_i and of B, ``floor`` the result of
     :func:`_floor`.
     """
-    single = every_step.plant
+    single = every_step.dynamics
     a, b = single.transition[..., 0], single.input_matrix[..., 0]
     lifted = block_diag(np.hstack((a @ b, b)), np.hstack((b, 0.0 * b)))
-    each = paper.nodes.sensors.measurement_matrix[..., 0]
+    each = paper.sensors.measurement_matrix[..., 0]
     observed = np.hstack((each[0], 0.0 * each[0])) @ lifted
     return {
         "rank": int(np.linalg.matrix_rank(observed)), "columns": int(observed.shape[1]),
@@ -142,14 +141,16 @@ def decoupling(paper: UnknownInputSystem, every_step: UnknownInputSystem) -> dic
     }  # fmt: skip
 
 
-def _floor(system: UnknownInputSystem) -> list[list[float]]:
+def _floor(plant: DrivenPlant) -> list[list[float]]:
     """Return mean squared errors (l, 2) of C⁻¹ y, the only estimate that (14) allows."""
-    b = system.plant.input_matrix[..., 0]
+    dynamics, sensors = plant.dynamics, plant.sensors
+    a, b, w = (
+        matrix[..., 0]
+        for matrix in (dynamics.transition, dynamics.input_matrix, dynamics.process_covariance)
+    )
     result = []
-    sensors = system.nodes.sensors
     for c, v in zip(sensors.measurement_matrix[..., 0], sensors.covariance[..., 0], strict=True):
         spread = np.linalg.inv(c) @ v @ np.linalg.inv(c).T
-        a, w = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
         into = np.linalg.inv(b)
         inputs = into @ (spread + a @ spread @ a.T + w) @ into.T
         result.append([float(np.trace(spread)), float(np.trace(inputs))])

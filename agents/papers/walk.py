@@ -8,7 +8,7 @@ import numpy as np
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import BATCH
 from fusion_gym.policies.base import Policy, Requests, decide, owner_of

@@ -140,7 +140,7 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
     title = f"{env_id}: {command.episodes} episodes of {task.horizon} steps, seed {command.seed}"
     table = tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
     tables.console().print(table)
-    tables.console().print(tables.state_table(task.system.state_names, report["policies"]))
+    tables.console().print(tables.state_table(task.plant.state_names, report["policies"]))
     return report
 
 
@@ -172,7 +172,7 @@ def evaluation_report(
         "seed": seed,
         "horizon": task.horizon,
         "settings": task.settings,
-        "states": list(task.system.state_names),
+        "states": list(task.plant.state_names),
         "policies": {name: summarise(result) for name, result in results.items()},
         "quantiles": {name: robust_summary(result) for name, result in results.items()},
     }

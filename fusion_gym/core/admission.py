@@ -9,30 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import System
+from fusion_gym.core.plant import Plant
 from fusion_gym.errors import ConfigurationError, DivergenceError, refusal
 
 LARGEST_ERROR = 1e32  # mean square; rewards become float32
 # Relative errors above the first value give a warning, above the second an error.
 _RIGHT, _WRONG = 1e-9, 0.2
-# Factors of the ratios of `System.rounding`, fitted to 50-digit computations.
+# Factors of the ratios of `Plant.rounding`, fitted to 50-digit computations.
 _OF_SIGNAL, _OF_LOSS = 2.0, 0.13
 _PRECISION = float(np.finfo(np.float64).eps)
 
 
-def admit(system: System[Any], horizon: int) -> Array:
-    """Return the open-loop error variances (n,) of a system that float64 can simulate.
+def admit(plant: Plant[Any], horizon: int) -> Array:
+    """Return the open-loop error variances (n,) of a plant that float64 can simulate.
 
     Args:
-        system: The system; an accuracy of its estimates below 1e-9 gives a warning.
+        plant: The plant; an accuracy of its estimates below 1e-9 gives a warning.
         horizon: Steps of an episode.
 
     Raises:
         ConfigurationError: The variances exceed ``LARGEST_ERROR``, or rounding errors exceed 20 %.
             The message has the longest horizon that is allowed.
     """
-    open_loop = system.open_loop(horizon)
-    accuracy = _accuracy(system, horizon)
+    open_loop = plant.open_loop(horizon)
+    accuracy = _accuracy(plant, horizon)
     if accuracy <= _RIGHT:
         return open_loop
     if accuracy <= _WRONG:
@@ -44,7 +44,7 @@ def admit(system: System[Any], horizon: int) -> Array:
         )
         return open_loop
     largest = np.nan_to_num(open_loop.max(), nan=np.inf)
-    signal, variance = system.rounding(horizon)
+    signal, variance = plant.rounding(horizon)
     signals, variances = (_WRONG / _OF_SIGNAL / _PRECISION) ** 2, _WRONG / _OF_LOSS / _PRECISION
     why = (
         f"float64 allows mean squared errors up to {LARGEST_ERROR:g} without transmissions (here "
@@ -54,7 +54,7 @@ def admit(system: System[Any], horizon: int) -> Array:
     )
     # The loss of accuracy grows with the horizon.
     longest = bisect_left(
-        range(1, horizon), True, key=lambda steps: not _accuracy(system, steps) <= _WRONG
+        range(1, horizon), True, key=lambda steps: not _accuracy(plant, steps) <= _WRONG
     )
     if not longest:
         raise ConfigurationError(f"these numbers together are not allowed: {why}")
@@ -62,11 +62,11 @@ def admit(system: System[Any], horizon: int) -> Array:
     raise refusal("horizon", horizon, allowed, "with this plant and these sensors")
 
 
-def _accuracy(system: System[Any], horizon: int) -> float:
+def _accuracy(plant: Plant[Any], horizon: int) -> float:
     """Estimate the largest relative rounding error of means (in deviations) and variances."""
-    if not system.open_loop(horizon).max() <= LARGEST_ERROR:
+    if not plant.open_loop(horizon).max() <= LARGEST_ERROR:
         return np.inf
-    signal, loss = system.rounding(horizon)
+    signal, loss = plant.rounding(horizon)
     return _PRECISION * float(np.maximum(_OF_SIGNAL * np.sqrt(signal), _OF_LOSS * loss))
 
 

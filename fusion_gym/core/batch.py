@@ -7,18 +7,27 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array, merge_runs
 from fusion_gym.core.admission import require_finite
-from fusion_gym.core.beliefs import Owner, arrived
+from fusion_gym.core.beliefs import Owner
+from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import Lazy, Outcome, Runs, value_of
-from fusion_gym.core.system import System
+from fusion_gym.core.runs import (
+    Branch,
+    Lazy,
+    Outcome,
+    Position,
+    Runs,
+    State,
+    advance,
+    start_of,
+    value_of,
+)
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
 
@@ -41,9 +50,9 @@ class EpisodeBatch(Runs):
         num_envs: Number N of runs.
         memory_owner: Owner of the memory: ``"scheduler"``, or ``"own"`` for every local sensor;
             ``None`` is the scheduler.
-        reference: System on the same noise whose filter processes every measurement, for rewards in
-            training. After each step ``reference_error`` (n, N) is the truth minus its estimate x*.
-        noise: Source of the noise, by default the task's, or else
+        reference: Estimator of every measurement, for rewards in training. After each step
+            ``reference_error`` (n, N) is the truth minus its estimate x*.
+        noise: Source of the plant's noise, by default the task's, or else
             :class:`~fusion_gym.core.noise.PhiloxNoise`.
     """
 
@@ -54,33 +63,32 @@ class EpisodeBatch(Runs):
         task: Task,
         num_envs: int,
         memory_owner: Owner | None = None,
-        reference: System[Any] | None = None,
+        reference: Estimator[Any] | None = None,
         noise: NoiseSource | None = None,
     ) -> None:
         memory = Memory(task, "scheduler" if memory_owner is None else memory_owner)
         super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
         self.source: NoiseSource = noise or task.noise or PhiloxNoise()
+        self.network_source: NoiseSource = PhiloxNoise(stream=1)
         self.seeds = np.random.SeedSequence().generate_state(num_envs, np.uint64).tolist()
         self.episodes = np.full(num_envs, -1)
         self.state = None
         self.reference = reference
         # The scheduler's memory replaces an identical reference.
         self._shared = (
-            reference is not None and memory.keeps_every and reference is task.memory_system
+            reference is not None and memory.keeps_every and reference is task.memory_estimator
         )
-        self._full_state: Any = None  # the reference's state, after sensing
+        self._full_state: Any = None  # the reference's state after observing
         self._program = self._compiled() if task.backend == "jax" else None
         # State, position and observations (entries, N) after the program's last step.
         self._computed: Lazy | None = None
         self._rows: list[Any] = []
         self._observed: NDArray[np.float32] | None = None
-        self.tokens = task.bucket.start(num_envs)
-        self.queue = task.bucket.start_queue(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.finished = np.ones(num_envs, dtype=np.bool_)
-        self._limit = np.full(num_envs, task.horizon, dtype=np.int64)
+        self.limit = np.full(num_envs, task.horizon, dtype=np.int64)
         most = min(_BLOCK_OF_RUN, _BLOCK // num_envs) // max(1, self.channels)
         self._block = np.zeros((min(task.horizon + 1, max(1, most)), self.channels, num_envs))
         self._row = 0  # row of the block with the last sensing's noise
@@ -119,36 +127,41 @@ class EpisodeBatch(Runs):
         """
         runs = np.arange(self.num_envs) if runs is None else runs
         everyone = np.array_equal(runs, np.arange(self.num_envs))
-        system, source, horizon = self.task.system, self.source, self.task.horizon
+        task, horizon = self.task, self.task.horizon
         self.episodes[runs] += 1
         self.steps[runs] = 0
         self.finished[runs] = False
-        self._limit[runs] = horizon
+        self.limit[runs] = horizon
         if stagger:
             parts = len(runs) if groups is None else min(groups, len(runs))
             part = (np.arange(len(runs)) * parts) // len(runs)
-            self._limit[runs] = horizon - (part * horizon) // parts
+            self.limit[runs] = horizon - (part * horizon) // parts
         keys = self._keys(runs)
-        noise = np.empty((len(runs), system.start_channels))
-        for place, key in enumerate(keys):
-            noise[place] = source.start(*key, noise.shape[1])
-        if self.task.reward.price.fixed is None:
-            drawn = np.array([source.uniform(*key) for key in keys])
-            self.price = merge_runs(self.price, self.task.reward.price.draw(drawn), runs)
+        if task.reward.price.fixed is None:
+            drawn = np.array([self.source.uniform(*key) for key in keys])
+            self.price = merge_runs(self.price, task.reward.price.draw(drawn), runs)
         if everyone:
             self._row = 0
         self._draw(runs)
-        first = np.ascontiguousarray(noise.T)
-        fresh = system.start(first)
-        row = self.noise() if everyone else self.noise()[:, runs]
-        self.memory.begin(first, fresh, row, runs, self.num_envs)
+        sources = (
+            (self.source, task.plant.start_channels),
+            (self.network_source, task.network.start_channels),
+        )
+        noise = np.concatenate([_starts(source, keys, count) for source, count in sources])
+        row = self.normals() if everyone else self.normals()[:, runs]
+        start, announcement = start_of(task, noise)
+        state = advance(task, start, row, self.steps[runs])
+        first, measurement = (task.plant.measurement(part.plant) for part in (start, state))
+        self.memory.begin(first, announcement, measurement, runs, self.num_envs)
         if self.reference is not None and not self._shared:
-            beside = self.reference.sense(self.reference.start(first), row)
+            beside = self.reference.predict(self.reference.start(first, announcement))
+            beside = self.reference.observe(beside, measurement)
             self._full_state = beside if everyone else merge_runs(self._full_state, beside, runs)
-        fresh = system.sense(fresh, row)
-        self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
-        self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
-        self.queue = merge_runs(self.queue, self.task.bucket.start_queue(len(runs)), runs)
+        if len(task.network.delay) > 1:
+            nothing = np.zeros((task.sensors, len(runs)), dtype=np.bool_)
+            last = state.estimate, measurement, nothing
+            state = state._replace(history=(last,) * (len(task.network.delay) - 1))
+        self.state = state if everyone else merge_runs(self.state, state, runs)
 
     def step(self, requests: NDArray[np.bool_]) -> Outcome:
         """Grant requests, update, fuse and reward; then move the plant and sense.
@@ -159,14 +172,16 @@ class EpisodeBatch(Runs):
             requests: (sensors, N) bool.
 
         Raises:
-            ResetNeeded: The batch was never reset.
+            RuntimeError: The batch was never reset.
             DivergenceError: The error of an unfinished run is not finite.
         """
         if self._state is None:
-            raise ResetNeeded("call reset before the first step")
+            raise RuntimeError("call reset before the first step")
         outcome = self.deliver(requests) if self._program is None else self._run_program(requests)
         if not math.isfinite(np.vdot(outcome.error, outcome.error)):
-            mean, covariance = self.task.system.fused(self.delivered)
+            estimate = self.delivered.estimate
+            covariance = self.task.estimator.covariance(estimate)
+            mean = self.task.estimator.mean(estimate)
             values = {"covariance": covariance, "mean": mean, "truth": outcome.error}
             require_finite(values, self.finished, self.steps)
         if self.reference is not None:
@@ -175,7 +190,9 @@ class EpisodeBatch(Runs):
             self._move()
             self.sense(self.normals())
         if self.reference is not None and not self._shared:
-            self._full_state = self.reference.sense(self._full_state, self.noise())
+            predicted = self.reference.predict(self._full_state)
+            measurement = self.task.plant.measurement(self.state.plant)
+            self._full_state = self.reference.observe(predicted, measurement)
         self.finished = outcome.ended.copy()
         return outcome
 
@@ -195,13 +212,9 @@ class EpisodeBatch(Runs):
         """Return a view of the last sensing's normals (channels, N)."""
         return self._block[self._row]
 
-    def noise(self) -> Array:
-        """Return the part (noise_channels, N) of :meth:`normals` that the system takes."""
-        return self.normals()[: self.task.system.noise_channels]
-
     def snapshot(self) -> dict[str, Any]:
         """Return the state of all runs for :meth:`restore`, valid until the next step."""
-        fixed = ("task", "layout", "memory", "reference", "source", "_program")
+        fixed = ("task", "layout", "memory", "reference", "source", "network_source", "_program")
         moving = {key: value for key, value in vars(self).items() if key not in fixed}
         return moving | {"memory_states": self.memory.states}
 
@@ -217,24 +230,31 @@ class EpisodeBatch(Runs):
     def _compiled(self) -> CompiledStep:
         from fusion_gym.core.compiled import CompiledStep
 
-        if self.memory.states is not None:
+        if self.memory.estimators:
             raise refusal("backend", "jax", "'numpy' with memory or the beliefs of local sensors")
         return CompiledStep(self.task, Memory(self.task, self.memory.owner), self.layout)
 
     def _run_program(self, requests: NDArray[np.bool_]) -> Outcome:
         """Make both halves of a step under JAX."""
-        program, before, system = self._program, self._state, self.task.system
+        program, before = self._program, self._state
         assert program is not None
         if before is not self._computed or not self._rows:
             self._rows = program.pack(self.position())
         self.steps = self.steps + 1
         self._move()
         rows, after = program(self._rows, requests, self.normals())
-        outcome, self.tokens, self.queue, self._observed = after
+        outcome, self._observed = after
         self._rows = rows
         self._computed = self._state = Lazy(lambda: program.position(rows).state)
-        self._delivered = Lazy(lambda: system.deliver(value_of(before), outcome.granted))
-        self.memory.sense(self.noise())
+
+        def delivered() -> State:
+            position = Position(value_of(before), self.price, self.steps, self.limit)
+            branch = Branch(self.task, self.memory, self.layout, position)
+            branch.deliver(requests)
+            return branch.delivered
+
+        self._delivered = Lazy(delivered)
+        self.memory.forget()
         return outcome
 
     def _move(self) -> None:
@@ -244,18 +264,15 @@ class EpisodeBatch(Runs):
             self._row = 0
             self._draw(np.arange(self.num_envs))
 
-    def _refer(self, system: System[Any]) -> None:
+    def _refer(self, estimator: Estimator[Any]) -> None:
         """Update the reference with every measurement of this step."""
         if self._shared:
-            assert self.memory.states is not None
-            beside = self.memory.states.every
+            beside = self.memory.states["every"]
         else:
             everyone = np.ones((self.task.sensors, self.num_envs), dtype=np.bool_)
-            self._full_state = beside = arrived(system, self._full_state, everyone)
-        self.reference_error = system.truth(beside) - system.fused_mean(beside)
-
-    def _lottery(self) -> Array | None:
-        return self.normals()[-1] if self.task.access == "random" else None
+            self._full_state = beside = estimator.update(self._full_state, Reception(everyone))
+        truth = self.task.plant.truth(self.delivered.plant)
+        self.reference_error = truth - estimator.mean(beside)
 
     def _keys(self, runs: NDArray[np.int64]) -> list[tuple[int, int]]:
         """Return seed and episode number of these runs."""
@@ -265,14 +282,28 @@ class EpisodeBatch(Runs):
     def _draw(self, runs: NDArray[np.int64]) -> None:
         """Draw the noise of these runs from this row to the end of the block or episode."""
         rows, channels = len(self._block) - self._row, self.channels
+        own = self.task.plant.noise_channels
         lanes = self._block[self._row :].reshape(-1, self.num_envs)
-        counts = np.clip(self._limit[runs] + 1 - self.steps[runs], 0, rows)
+        counts = np.clip(self.limit[runs] + 1 - self.steps[runs], 0, rows)
         parts = zip(self._keys(runs), self.steps[runs].tolist(), counts.tolist(), strict=True)
         for begin in range(0, len(runs), _TOGETHER):
             some = runs[begin : begin + _TOGETHER]
             drawn = np.zeros((len(some), rows, channels))
             for into, (key, first, count) in zip(drawn, parts, strict=False):
-                into[:count] = self.source.steps(*key, first, count, channels)
+                into[:count, :own] = self.source.steps(*key, first, count, own)
+                if own < channels:
+                    into[:count, own:] = self.network_source.steps(
+                        *key, first, count, channels - own
+                    )
             beside = some[-1] - some[0] == len(some) - 1
             places = slice(some[0], some[-1] + 1) if beside else some
             lanes[:, places] = drawn.reshape(len(some), -1).T
+
+
+def _starts(source: NoiseSource, keys: list[tuple[int, int]], channels: int) -> Array:
+    """Return the normals (channels, R) of the starts of episodes with these keys."""
+    noise = np.empty((len(keys), channels))
+    if channels:
+        for place, key in enumerate(keys):
+            noise[place] = source.start(*key, channels)
+    return np.ascontiguousarray(noise.T)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.system import System
+from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import covariance_intersection
 
@@ -36,20 +36,10 @@ Owner = Literal["scheduler", "own"]
 Packets = NDArray[np.bool_]
 
 
-@dataclass(slots=True)
-class MemoryStates:
-    """The memory states of N runs after sensing, ``None`` where none is needed.
-
-    Attributes:
-        every: State (N runs) of a filter with all measurements.
-        own: States (sensors · N runs, a sensor's runs adjacent) of a filter with one sensor's
-            measurements and received packets.
-        single: States, in the order of ``own``, of a centre with deliveries from that sensor only.
-    """
-
-    every: Any = None
-    own: Any = None
-    single: Any = None
+# States of N runs after sensing: "every" (N runs) of an estimator with all measurements, "own"
+# (sensors · N runs, a sensor's runs adjacent) with one sensor's measurements and received packets,
+# and "single", in the order of "own", of a centre with deliveries from that sensor only.
+MemoryStates = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -82,25 +72,24 @@ class Beliefs(ABC):
 
     Args:
         task: The task.
-        state: The system's state after sensing.
+        estimate: The estimator's state after observing.
         memory_states: The memory states.
+        arrival: Probability (sensors, N) that a packet sent now arrives; ``None`` is 1.
         best: x*, if it is known.
-
-    Attributes:
-        arrival: Probability (sensors, N) that a packet arrives if it is sent now; ``None`` is 1.
     """
 
     def __init__(
-        self, task: Task, state: Any, memory_states: MemoryStates, best: Estimate | None = None
+        self,
+        task: Task,
+        estimate: Any,
+        memory_states: MemoryStates,
+        arrival: Array | None,
+        best: Estimate | None = None,
     ) -> None:
         if best is not None:
             vars(self)["best"] = best
-        self.task, self.memory_states, self._state = task, memory_states, state
-        system = task.system
-        self.arrival: Array | None = None
-        if system.offers("arrival_probability"):
-            self.arrival = system.arrival_probability(state)
-        self._runs = system.truth(state).shape[-1]
+        self.task, self.memory_states, self.arrival = task, memory_states, arrival
+        self._estimate, self._runs = estimate, estimate.measurement.shape[-1]
 
     @property
     @abstractmethod
@@ -121,6 +110,13 @@ class Beliefs(ABC):
     @abstractmethod
     def memory_posterior(self) -> Any:
         """Memory state after the update with the owner's new measurements."""
+
+    def update(self, estimator: Estimator[Any], state: Any, packets: Packets) -> Any:
+        """Return the state after the arrival of these packets (sensors, …) and no others."""
+        failure = None
+        if estimator.reads_silence and self.arrival is not None:
+            failure = np.tile(1.0 - self.arrival, packets.shape[-1] // self._runs)
+        return estimator.update(state, Reception(packets, failure=failure))
 
     @cached_property
     def difference(self) -> Array:
@@ -168,16 +164,17 @@ class SchedulerBeliefs(Beliefs):
     @cached_property
     def silent(self) -> Estimate:
         """x̂, the centre's estimate without a transmission."""
-        return _fused(self.task.system, self._silent)
+        return _fused(self.task.estimator, self._silent)
 
     @cached_property
     def sent(self) -> Estimate:
         """x̂(s); with ``packet="estimate"`` it is x* for every s."""
         if self.task.packet == "estimate":
             return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
-        if self.task.system.offers("single_deliveries"):
-            return Estimate(*self.task.system.single_deliveries(self._state))
-        each = [_fused(self.task.system, delivered) for delivered in self._sent]
+        single = self.task.estimator.single_deliveries(self._estimate)
+        if single is not None:
+            return Estimate(*single)
+        each = [_fused(self.task.estimator, updated) for updated in self._sent]
         return Estimate(
             np.concatenate([item.mean for item in each]),
             lambda: np.concatenate([item.covariance for item in each]),
@@ -186,16 +183,16 @@ class SchedulerBeliefs(Beliefs):
     @cached_property
     def best(self) -> Estimate:
         """x*, the estimate with all knowledge of the scheduler."""
-        return _fused(self.task.memory_system or self.task.system, self.memory_posterior)
+        return _fused(self.task.memory_estimator or self.task.estimator, self.memory_posterior)
 
     @cached_property
     def memory_posterior(self) -> Any:
         """Memory state after the update; without memory the centre's state after all packets."""
         everyone = ~self._no_packets(self._runs)
-        if self.memory_states.every is None:
-            return arrived(self.task.system, self._state, everyone)
-        assert self.task.memory_system is not None
-        return arrived(self.task.memory_system, self.memory_states.every, everyone)
+        if "every" not in self.memory_states:
+            return self.update(self.task.estimator, self._estimate, everyone)
+        assert self.task.memory_estimator is not None
+        return self.update(self.task.memory_estimator, self.memory_states["every"], everyone)
 
     def loss(self, steps: int = 1) -> Array:
         """Return ‖x* - x̂‖² (1, N), summed over ``steps`` steps without noise and transmissions."""
@@ -219,7 +216,7 @@ class SchedulerBeliefs(Beliefs):
 
     @cached_property
     def _silent(self) -> Any:
-        return self.task.system.deliver(self._state, self._no_packets(self._runs))
+        return self.update(self.task.estimator, self._estimate, self._no_packets(self._runs))
 
     @cached_property
     def _sent(self) -> list[Any]:
@@ -228,16 +225,16 @@ class SchedulerBeliefs(Beliefs):
         for sensor in range(self.task.sensors):
             single = self._no_packets(self._runs)
             single[sensor] = True
-            result.append(arrived(self.task.system, self._state, single))
+            result.append(self.update(self.task.estimator, self._estimate, single))
         return result
 
     def _best_path(self, steps: int) -> Array:
         return silent_path(
-            self.task.memory_system or self.task.system, self.memory_posterior, steps
+            self.task.memory_estimator or self.task.estimator, self.memory_posterior, steps
         )
 
-    def _path(self, delivered: Any, steps: int) -> Array:
-        return silent_path(self.task.system, delivered, steps)
+    def _path(self, updated: Any, steps: int) -> Array:
+        return silent_path(self.task.estimator, updated, steps)
 
 
 class OwnBeliefs(Beliefs):
@@ -246,11 +243,13 @@ class OwnBeliefs(Beliefs):
     @cached_property
     def silent(self) -> Estimate:
         """x̂, the centre's estimate without a transmission, as each sensor knows it."""
-        system, sensors = self.task.system, self.task.sensors
+        estimator, sensors = self.task.estimator, self.task.sensors
         if self.task.broadcast == "none":
             silence = self._no_packets(sensors * self._runs)
-            return self._each(system, system.deliver(self.memory_states.single, silence))
-        received = _fused(system, system.deliver(self._state, self._no_packets(self._runs)))
+            single = self.memory_states["single"]
+            return self._each(estimator, self.update(estimator, single, silence))
+        silence = self._no_packets(self._runs)
+        received = _fused(estimator, self.update(estimator, self._estimate, silence))
         return Estimate(
             np.repeat(received.mean, sensors, axis=0),
             lambda: np.repeat(received.covariance, sensors, axis=0),
@@ -259,21 +258,23 @@ class OwnBeliefs(Beliefs):
     @cached_property
     def sent(self) -> Estimate:
         """x̂(s), the centre's estimate if only the packet of s arrives, as sensor s knows it."""
-        system, itself = self.task.system, self._itself
-        if self.memory_states.single is None:
-            if system.offers("single_deliveries"):
-                return Estimate(*system.single_deliveries(self._state))
+        estimator, state = self.task.estimator, self.memory_states.get("single")
+        if state is None:
+            single = estimator.single_deliveries(self._estimate)
+            if single is not None:
+                return Estimate(*single)
             every = np.tile(np.arange(self._runs), self.task.sensors)
-            return self._each(system, arrived(system, take_runs(self._state, every), itself))
-        own = self._each(system, arrived(system, self.memory_states.single, itself))
-        return own if self.task.broadcast == "none" else _joined(self.silent, own)
+            state = take_runs(self._estimate, every)
+        own = self._each(estimator, self.update(estimator, state, self._itself))
+        alone = "single" not in self.memory_states or self.task.broadcast == "none"
+        return own if alone else _joined(self.silent, own)
 
     @cached_property
     def best(self) -> Estimate:
         """x*, the estimate with all knowledge of each sensor."""
-        if self.task.memory_system is None:
+        if self.task.memory_estimator is None:
             return self.sent
-        own = self._each(self.task.memory_system, self.memory_posterior)
+        own = self._each(self.task.memory_estimator, self.memory_posterior)
         if self.task.broadcast != "estimate":
             return own
         return _joined(self.sent if self.task.feedback else self.silent, own)
@@ -281,17 +282,17 @@ class OwnBeliefs(Beliefs):
     @cached_property
     def memory_posterior(self) -> Any:
         """Memory states after the update with each sensor's own measurement."""
-        assert self.task.memory_system is not None
-        return arrived(self.task.memory_system, self.memory_states.own, self._itself)
+        assert self.task.memory_estimator is not None
+        return self.update(self.task.memory_estimator, self.memory_states["own"], self._itself)
 
     @property
     def _itself(self) -> Packets:
         """Each sensor's packet in its own runs (sensors, sensors · N)."""
         return np.repeat(np.eye(self.task.sensors, dtype=np.bool_), self._runs, axis=-1)
 
-    def _each(self, system: System[Any], delivered: Any) -> Estimate:
+    def _each(self, estimator: Estimator[Any], updated: Any) -> Estimate:
         """Return one estimate per sensor from sensors · N runs."""
-        shape, whole = (self.task.sensors, self._runs), _fused(system, delivered)
+        shape, whole = (self.task.sensors, self._runs), _fused(estimator, updated)
 
         def apart(values: Array) -> Array:
             return np.moveaxis(values.reshape(*values.shape[:-1], *shape), -2, 0)
@@ -307,30 +308,23 @@ def _require_single_step(steps: int) -> None:
         )
 
 
-def arriving(system: System[Any], state: Any, packets: Packets) -> Any:
-    """Return the state in which the channel does not lose these packets (sensors, N)."""
-    return system.arriving(state, packets) if system.offers("arriving") else state
-
-
-def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
-    """Return fused means (steps, n, N) without noise and transmissions."""
-    runs = system.truth(delivered).shape[-1]
-    still = np.zeros((system.noise_channels, runs))
-    silence = np.zeros((system.sensor_count, runs), dtype=np.bool_)
-    means = [system.fused_mean(delivered)]
+def silent_path(estimator: Estimator[Any], updated: Any, steps: int) -> Array:
+    """Return fused means (steps, n, N) without measurements and transmissions."""
+    means = [estimator.mean(updated)]
+    silence = None
     for _ in range(steps - 1):
-        delivered = system.deliver(system.sense(delivered, still), silence)
-        means.append(system.fused_mean(delivered))
+        predicted = estimator.predict(updated)
+        if silence is None:
+            shape = len(predicted.measurement), means[0].shape[-1]
+            silence = Reception(np.zeros(shape, dtype=np.bool_))
+        updated = estimator.update(predicted, silence)
+        means.append(estimator.mean(updated))
     return np.stack(means)
 
 
-def arrived(system: System[Any], state: Any, packets: Packets) -> Any:
-    """Return the state after the arrival of these packets and no others."""
-    return system.deliver(arriving(system, state, packets), packets)
-
-
-def _fused(system: System[Any], delivered: Any) -> Estimate:
-    return Estimate(system.fused_mean(delivered)[None], lambda: system.fused(delivered)[1][None])
+def _fused(estimator: Estimator[Any], updated: Any) -> Estimate:
+    mean = estimator.mean(updated)[None]
+    return Estimate(mean, lambda: estimator.covariance(updated)[None])
 
 
 def _joined(first: Estimate, second: Estimate) -> Estimate:

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 
 from fusion_gym import validation
+from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.options import Feature, Scenario
-from fusion_gym.core.system import System
 
 FEATURES: tuple[str, ...] = get_args(Feature)
 
@@ -15,21 +15,21 @@ class Communication(NamedTuple):
 
     Attributes:
         broadcast: ``"none"``, ``"estimate"`` or ``"packets"``.
-        memory_system: System whose filter is the memory, or ``None`` without memory.
+        memory_estimator: Estimator of the memory, or ``None`` without memory.
         features: Observation entries of the memory, ``"difference"`` and ``"value"``.
     """
 
     broadcast: str
-    memory_system: System[Any] | None
+    memory_estimator: Estimator[Any] | None
     features: tuple[str, ...]
 
 
 def communication(scenario: Scenario) -> Communication:
     """Return the checked communication model of a scenario."""
     options = scenario.options
-    has_memory, memory_system = options.memory, scenario.memory_system
-    if memory_system is None and not scenario.nodes_have_memory:
-        memory_system = scenario.system
+    has_memory, memory_estimator = options.memory, scenario.memory_estimator
+    if memory_estimator is None and not scenario.nodes_have_memory:
+        memory_estimator = scenario.estimator
     if has_memory and options.information == "centre":
         allowed = "False, because the centre stores only deliveries"
         raise validation.refusal("memory", True, allowed, "with information='centre'")
@@ -39,19 +39,19 @@ def communication(scenario: Scenario) -> Communication:
     if features and options.information == "centre":
         allowed = "None or empty with information='centre'"
         raise validation.refusal("belief_features", options.belief_features, allowed)
-    if options.memory_filter is not None and scenario.memory_system is None:
+    if options.memory_filter is not None and scenario.memory_estimator is None:
         allowed = "None here, because this system has one filter"
         raise validation.refusal("memory_filter", options.memory_filter, allowed)
     if options.packet == "estimate":
         _check_estimates(scenario, has_memory)
-    return Communication(_broadcast(scenario), memory_system if has_memory else None, features)
+    return Communication(_broadcast(scenario), memory_estimator if has_memory else None, features)
 
 
 def _check_estimates(scenario: Scenario, has_memory: bool) -> None:
     reason = scenario.no_estimates
     if not has_memory:
         reason = "an estimate needs memory=True"
-    elif scenario.system.offers("arriving") or not scenario.system.offers("adopt"):
+    elif not scenario.estimator.adopts:
         reason = reason or "this system's centre cannot continue from a delivered estimate"
     if reason is not None:
         raise validation.refusal("packet", "estimate", f"'measurement', because {reason}", "here")

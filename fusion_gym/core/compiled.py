@@ -20,7 +20,6 @@ from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Outcome, Position
 from fusion_gym.core.task import Task
-from fusion_gym.core.token_bucket import Queue
 from fusion_gym.importing import require
 
 require("an environment under JAX", "jax", "jax")
@@ -40,10 +39,16 @@ _ROWS = 64
 
 
 def register_state(state: Any) -> None:
-    """Register the dataclass of a system's states with JAX."""
-    if jax.tree_util.all_leaves([state]):
+    """Register the dataclasses of states with JAX, through tuples and dataclasses."""
+    if isinstance(state, tuple):
+        for part in state:
+            register_state(part)
+    elif dataclasses.is_dataclass(state):
         names = [field.name for field in dataclasses.fields(state)]
-        jax.tree_util.register_dataclass(type(state), names, [])
+        if jax.tree_util.all_leaves([state]):
+            jax.tree_util.register_dataclass(type(state), names, [])
+        for name in names:
+            register_state(getattr(state, name))
 
 
 def refuse_in_forks(owner: type, *methods: str) -> None:
@@ -64,11 +69,9 @@ def refuse_in_forks(owner: type, *methods: str) -> None:
 
 
 class Result(NamedTuple):
-    """The outcome of a step, and the tokens, queue and observations (entries, N) after it."""
+    """The outcome of a step, and the observations (entries, N) after it."""
 
     outcome: Outcome
-    tokens: Array
-    queue: Queue
     observation: NDArray[np.float32]
 
 
@@ -96,7 +99,7 @@ class CompiledStep:
 
     def pack(self, position: Position) -> Any:
         """Return the rows of a position, a list of arrays (rows, N)."""
-        register_state(position.state)
+        register_state(position)
         self._position = _Rows(position)
         return self._position.pack(np, position)
 
@@ -114,7 +117,7 @@ class CompiledStep:
     def _trace(self, rows: Any, requests: Any, noise: Any) -> tuple[list[Any], list[Any]]:
         runs = Branch(*self._runs, self._position.unpack(rows))
         outcome = runs.step(requests, noise)
-        result = Result(outcome, runs.tokens, runs.queue, runs.observe().T)
+        result = Result(outcome, runs.observe().T)
         self._result = _Rows(result)
         return self._position.pack(jnp, runs.position()), self._result.pack(jnp, result)
 

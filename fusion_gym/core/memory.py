@@ -1,8 +1,7 @@
 """The memory of N runs: measurements that were taken and not sent, and the beliefs they imply.
 
-A memory state belongs to the same plant, noise, tokens and past channel, with a filter that has
-processed every measurement of its owner. The scheduler has all measurements. A local sensor has its
-own measurements and the broadcasts:
+A memory state is the state of an estimator that has processed every measurement of its owner. The
+scheduler has all measurements. A local sensor has its own measurements and the broadcasts:
 
 - ``"none"``: It knows which of its packets arrived, and models a centre with its packets only.
 - ``"estimate"``: It receives the centre's prediction with its covariance, and joins it with its own
@@ -28,8 +27,8 @@ from fusion_gym.core.beliefs import (
     OwnBeliefs,
     Owner,
     SchedulerBeliefs,
-    arriving,
 )
+from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
@@ -43,10 +42,12 @@ class Memory:
         owner: ``"scheduler"``, or ``"own"`` for every local sensor.
 
     Attributes:
-        states: Memory states after sensing, ``None`` without any.
+        estimators: Estimators of the memory states, by name.
+        states: Memory states after sensing, by name.
 
     Raises:
-        ConfigurationError: The owner is local and packets hold the scheduler's estimate.
+        ConfigurationError: The owner is local, and packets hold the scheduler's estimate or may be
+            late.
     """
 
     def __init__(self, task: Task, owner: Owner) -> None:
@@ -56,78 +57,73 @@ class Memory:
         if own and task.packet == "estimate":
             why = "with local sensors, because the estimate belongs to the scheduler"
             raise refusal("packet", task.packet, f"'measurement' {why}")
-        distant = task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
-        self._needs_single = own and distant
-        self._needs_own = own and task.memory_system is not None
-        self.keeps_every = not own and task.memory_system is not None
-        keeps = self.keeps_every or self._needs_own or self._needs_single
-        self.states = MemoryStates() if keeps else None
+        if own and len(task.network.delay) > 1:
+            raise refusal("delay", task.network.delay, "none with the memory of local sensors")
+        self.estimators: dict[str, Estimator[Any]] = {}
+        if task.memory_estimator is not None:
+            self.estimators["own" if own else "every"] = task.memory_estimator
+        if own and (
+            task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
+        ):
+            self.estimators["single"] = task.estimator
+        self.keeps_every = "every" in self.estimators
+        self.states: MemoryStates = {}
         self._beliefs: Beliefs | None = None
 
     def begin(
-        self, noise: Array, fresh: Any, row: Array, runs: NDArray[np.int64], num_envs: int
+        self,
+        first: Array,
+        announcement: Any,
+        measurement: Array,
+        runs: NDArray[np.int64],
+        num_envs: int,
     ) -> None:
-        """Start and sense in the R runs ``runs``.
+        """Start in the R runs ``runs``, and observe.
 
         Args:
-            noise: Normals (start_channels, R) of the start.
-            fresh: The system's states of the start.
-            row: Normals (noise_channels, R) of the first sensing.
+            first: Measurements (sensors, m, R) at time 0.
+            announcement: The plant's announcement of the start.
+            measurement: Measurements (sensors, m, R) of the first sensing.
             runs: Numbers of the runs (R,).
             num_envs: Number of all runs.
         """
-        self._beliefs = None
-        if self.states is None:
-            return
-        first, system = fresh, self.task.memory_system
-        if system is not None and system is not self.task.system:
-            first = system.start(noise)
-        every = np.tile(np.arange(noise.shape[-1]), self.task.sensors)
-        new = self._sensed(
-            MemoryStates(
-                every=first if self.keeps_every else None,
-                own=take_runs(first, every) if self._needs_own else None,
-                single=take_runs(fresh, every) if self._needs_single else None,
-            ),
-            row,
-        )
+        fresh, every = {}, np.arange(len(runs))
+        for name, estimator in self.estimators.items():
+            start = estimator.start(first, announcement)
+            fresh[name] = take_runs(start, np.tile(every, self._copies(name)))
+        new, old = self._observed(fresh, measurement), self.states
         if len(runs) < num_envs:
-            old, many = self.states, self._places(runs, num_envs)
-            new = MemoryStates(
-                every=merge_runs(old.every, new.every, runs),
-                own=merge_runs(old.own, new.own, many),
-                single=merge_runs(old.single, new.single, many),
-            )
-        self.states = new
+            for name, state in new.items():
+                new[name] = merge_runs(old[name], state, self._places(name, runs, num_envs))
+        self.states, self._beliefs = new, None
 
-    def beliefs(self, state: Any) -> Beliefs:
-        """Return the owner's beliefs before any transmission in the runs' sensed state."""
-        if self._beliefs is None:
-            self._beliefs = self._make_beliefs(state)
-        return self._beliefs
-
-    def deliver(self, state: Any, delivered: Any, granted: NDArray[np.bool_]) -> Any:
-        """Update the memory after grants (sensors, N) in the runs' sensed state.
-
-        With ``packet="estimate"`` the centre of the returned state has x* where a packet arrived.
+    def beliefs(self, estimate: Any, arrival: Array | None) -> Beliefs:
+        """Return the owner's beliefs before any transmission.
 
         Args:
-            state: The runs' sensed state.
-            delivered: The system's state after its delivery.
-            granted: (sensors, N) bool.
+            estimate: The estimator's state after observing.
+            arrival: Probability (sensors, N) that a packet sent now arrives; ``None`` is 1.
         """
-        if self.task.packet == "estimate":
-            mean, covariance = self.beliefs(state).best
-            arrived = np.asarray(granted.any(0))
-            delivered = self.task.system.adopt(delivered, mean[0], covariance[0], arrived)
-        if self.states is not None:
-            self.states = self._delivered(self.states, self.beliefs(state), granted)
-        return delivered
+        if self._beliefs is None:
+            self._beliefs = self._make_beliefs(estimate, arrival)
+        return self._beliefs
 
-    def sense(self, noise: Array) -> None:
-        """Move the plant and measure, with noise (noise_channels, N)."""
-        if self.states is not None:
-            self.states = self._sensed(self.states, noise)
+    def update(self, beliefs: Callable[[], Beliefs], arrived: NDArray[np.bool_]) -> None:
+        """Update the memory after the packets (sensors, N) that arrive.
+
+        Args:
+            beliefs: Function that returns the beliefs before the transmission.
+            arrived: (sensors, N) bool.
+        """
+        if self.states:
+            self.states = self._updated(beliefs(), arrived)
+
+    def observe(self, measurement: Array) -> None:
+        """Predict, and take the new measurements (sensors, m, N)."""
+        self.states, self._beliefs = self._observed(self.states, measurement), None
+
+    def forget(self) -> None:
+        """Forget the beliefs of the step before."""
         self._beliefs = None
 
     def branch(self, runs: NDArray[np.int64] | None, num_envs: int) -> Self:
@@ -135,25 +131,22 @@ class Memory:
         result = copy.copy(self)
         if runs is not None:
             result._beliefs = None
-            if self.states is not None:
-                many = self._places(runs, num_envs)
-                result.states = MemoryStates(
-                    every=take_runs(self.states.every, runs),
-                    own=take_runs(self.states.own, many),
-                    single=take_runs(self.states.single, many),
-                )
+            result.states = {
+                name: take_runs(state, self._places(name, runs, num_envs))
+                for name, state in self.states.items()
+            }
         return result
 
-    def with_states(self, states: MemoryStates | None) -> Self:
+    def with_states(self, states: MemoryStates) -> Self:
         """Return a memory of other runs with these states."""
         result = copy.copy(self)
         result.states, result._beliefs = states, None
         return result
 
-    def with_best(self, state: Any, best: Estimate) -> Self:
-        """Return a memory of runs in a sensed state with known x*."""
-        result = self.with_states(None)
-        result._beliefs = result._make_beliefs(state, best)
+    def with_best(self, estimate: Any, arrival: Array | None, best: Estimate) -> Self:
+        """Return a memory of runs with known x*."""
+        result = self.with_states({})
+        result._beliefs = result._make_beliefs(estimate, arrival, best)
         return result
 
     def signals(self, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
@@ -165,43 +158,39 @@ class Memory:
         """Names of the signals of another owner's beliefs, and the reasons for their absence."""
         return missing_signals(self.owner)
 
-    def _make_beliefs(self, state: Any, best: Estimate | None = None) -> Beliefs:
+    def _make_beliefs(
+        self, estimate: Any, arrival: Array | None, best: Estimate | None = None
+    ) -> Beliefs:
         kind = OwnBeliefs if self.owner == "own" else SchedulerBeliefs
-        return kind(self.task, state, self.states or MemoryStates(), best)
+        return kind(self.task, estimate, self.states, arrival, best)
 
-    def _sensed(self, states: MemoryStates, noise: Array) -> MemoryStates:
-        system, memory_system = self.task.system, self.task.memory_system or self.task.system
-        result = MemoryStates()
-        if states.every is not None:
-            result.every = memory_system.sense(states.every, noise)
-        if states.own is not None or states.single is not None:
-            noise = np.tile(noise, self.task.sensors)
-        if states.own is not None:
-            result.own = memory_system.sense(states.own, noise)
-        if states.single is not None:
-            result.single = system.sense(states.single, noise)
+    def _observed(self, states: MemoryStates, measurement: Array) -> MemoryStates:
+        """Return the states after their own measurements (sensors, m, N)."""
+        result = {}
+        for name, state in states.items():
+            estimator, copies = self.estimators[name], self._copies(name)
+            own = np.tile(measurement, copies) if copies > 1 else measurement
+            result[name] = estimator.observe(estimator.predict(state), own)
         return result
 
-    def _delivered(
-        self, states: MemoryStates, beliefs: Beliefs, granted: NDArray[np.bool_]
-    ) -> MemoryStates:
-        result, itself = MemoryStates(), np.eye(self.task.sensors, dtype=np.bool_)
+    def _updated(self, beliefs: Beliefs, arrived: NDArray[np.bool_]) -> MemoryStates:
         # Each sensor's own packet in its own runs (sensors, sensors · N).
-        itself = np.repeat(itself, granted.shape[-1], axis=-1)
-        if states.every is not None:
-            result.every = beliefs.memory_posterior
-        if states.own is not None:
-            result.own = beliefs.memory_posterior
-            if self.task.broadcast == "packets":
-                system = self.task.memory_system
-                assert system is not None
-                received = np.tile(granted, self.task.sensors) | itself
-                result.own = system.deliver(arriving(system, states.own, itself), received)
-        if states.single is not None:
-            sent = np.tile(granted, self.task.sensors) & itself
-            result.single = self.task.system.deliver(states.single, sent)
+        itself = np.repeat(np.eye(self.task.sensors, dtype=np.bool_), arrived.shape[-1], axis=-1)
+        result = {}
+        for name, state in self.states.items():
+            if name == "single":
+                packets = np.tile(arrived, self.task.sensors) & itself
+            elif name == "own" and self.task.broadcast == "packets":
+                packets = np.tile(arrived, self.task.sensors) | itself
+            else:
+                result[name] = beliefs.memory_posterior
+                continue
+            result[name] = beliefs.update(self.estimators[name], state, packets)
         return result
 
-    def _places(self, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:
-        """Return the positions (sensors · R,) of the runs (R,) of every sensor."""
-        return (np.arange(self.task.sensors)[:, None] * num_envs + runs).ravel()
+    def _copies(self, name: str) -> int:
+        return 1 if name == "every" else self.task.sensors
+
+    def _places(self, name: str, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:
+        """Return the positions (copies · R,) of the runs (R,) in a memory state."""
+        return (np.arange(self._copies(name))[:, None] * num_envs + runs).ravel()

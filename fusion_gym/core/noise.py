@@ -30,9 +30,13 @@ class PhiloxNoise:
     episode is drawn independently of the other parts. Seeds from 2⁶⁴ on are hashed.
 
     Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+
+    Args:
+        stream: Number of an independent stream: 0 of the plant, 1 of the network.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stream: int = 0) -> None:
+        self._first = 3 * stream
         self._generator = np.random.Generator(np.random.Philox(key=0))
         self._fresh = {**self._generator.bit_generator.state, "buffer": [0, 0, 0, 0]}
 
@@ -58,6 +62,6 @@ class PhiloxNoise:
         key = [seed, 0]
         if seed >= 2**64:
             key = np.random.SeedSequence(seed).generate_state(2, np.uint64).tolist()
-        position = {"counter": [0, chunk, episode, purpose], "key": key}
+        position = {"counter": [0, chunk, episode, self._first + purpose], "key": key}
         self._generator.bit_generator.state = self._fresh | {"state": position}
         return self._generator

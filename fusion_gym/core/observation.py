@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,34 +10,16 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.channel import STATES
+from fusion_gym.core.knowledge import Block, Knowledge, covers, numbered
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Block, Knowledge, covers, numbered
 from fusion_gym.core.task import Task
-from fusion_gym.core.token_bucket import Queue
 from fusion_gym.namespace import namespace
 from fusion_gym.validation import ConfigurationError
 
 # Odd functions of the beliefs: they resolve small differences and do not saturate.
 _DIFFERENCE, _DIFFERENCE_LIMIT = 4.0, 10.0
 _VALUE, _VALUE_LIMIT = 2.0, 20.0
-
-
-class NetworkState(NamedTuple):
-    """The network's part of an observation.
-
-    Attributes:
-        tokens: (N,).
-        admitted: Function that returns the admitted sensors (sensors, N) bool.
-        price: Price of a token (N,).
-        left: Remaining steps of the episode (N,).
-        queue: Place of each sensor in the queue (sensors, N).
-    """
-
-    tokens: Array
-    admitted: Callable[[], NDArray[np.bool_]]
-    price: Array
-    left: Array
-    queue: Queue
 
 
 class ObservationEntry(NamedTuple):
@@ -60,34 +41,42 @@ class ObservationEntry(NamedTuple):
 
 
 def network_blocks(task: Task) -> tuple[Block, ...]:
-    """Return the network's blocks, whose values are functions of a `NetworkState`."""
-    capacity, price = task.bucket.capacity, task.reward.price
+    """Return the network's blocks, whose values are functions of `Runs`."""
+    bucket, channel, price = task.network.bucket, task.network.channel, task.reward.price
+    capacity, nodes = bucket.capacity, numbered(task.sensors)
+    channels = Block(
+        "channel",
+        "state of the channel at the step before, one-hot",
+        lambda runs: runs.channel_state()[:, None] == np.arange(len(STATES))[:, None],
+        (nodes, STATES),
+        node="own",
+    )
     tokens = Block(
         "tokens",
         "tokens over the capacity",
-        lambda net: net.tokens / capacity,
+        lambda runs: runs.tokens / capacity,
         node="broadcast",
         constants={"capacity": capacity},
     )
     admitted = Block(
         "admitted",
         "whether the access rule admits the sensor in this step",
-        lambda net: net.admitted(),
-        (numbered(task.sensors),),
+        lambda runs: runs.admitted(),
+        (nodes,),
         node="own",
     )
     queue = Block(
         "queue",
         "place in the queue over the number of sensors, 0 for the head",
-        lambda net: net.queue / task.sensors,
-        (numbered(task.sensors),),
+        lambda runs: runs.state.network.queue / task.sensors,
+        (nodes,),
         node="own",
         constants={"sensors": task.sensors},
     )
     left = Block(
         "time_left",
         "remaining steps over the horizon",
-        lambda net: net.left / task.horizon,
+        lambda runs: (runs.limit - runs.steps) / task.horizon,
         node="broadcast",
         constants={"horizon": task.horizon},
     )
@@ -95,13 +84,14 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     block = Block(
         "price",
         place,
-        lambda net: price.encode(net.price),
+        lambda runs: price.encode(runs.price),
         node="broadcast",
         constants={} if price.span is None else {"range": price.span},
     )
-    decides = task.access in ("round_robin", "random")
-    queues = task.bucket.sharing == "turns" and not task.bucket.unlimited
+    decides = task.network.access in ("round_robin", "random")
+    queues = bucket.sharing == "turns" and not bucket.unlimited
     return (
+        *((channels,) if channel is not None and channel.states > 1 else ()),
         tokens,
         *((admitted,) if decides else ()),
         *((queue,) if queues else ()),
@@ -126,7 +116,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         both = np.stack((silent, beliefs.value()), axis=1) / whole
         return _VALUE * np.sign(both) * np.sqrt(np.abs(both))
 
-    states, nodes = task.system.state_names, numbered(task.sensors)
+    states, nodes = task.plant.state_names, numbered(task.sensors)
     differences = partial(
         Block,
         meaning=f"arsinh({_DIFFERENCE:g} (x* − x̂)/σ), σ the nominal deviations",
@@ -194,7 +184,8 @@ class ObservationLayout:
             return tuple(block for block in blocks if covers(task.knowledge, block.knowledge))
 
         self._task, self._owner = task, owner
-        self._own, self._network = visible(task.system.observation), visible(network_blocks(task))
+        self._own = visible(task.estimator.observation)
+        self._network = visible(network_blocks(task))
         self._memory = visible(belief_blocks(task, owner))
         self.blocks = self._own + self._memory + self._network
         names = [block.name for block in self.blocks]
@@ -210,14 +201,12 @@ class ObservationLayout:
         """Pickle the task and the owner, because the blocks' functions may not be picklable."""
         return ObservationLayout, (self._task, self._owner)
 
-    def encode(
-        self, state: Any, network: NetworkState, beliefs: Callable[[], Beliefs]
-    ) -> NDArray[np.float32]:
-        """Return observations (N, entries) float32, clipped to their bounds."""
-        filled = [block.fill(state) for block in self._own]
-        filled += [block.fill(beliefs()) for block in self._memory]
-        filled += [block.fill(network) for block in self._network]
-        xp = namespace(network.tokens)
+    def encode(self, runs: Any) -> NDArray[np.float32]:
+        """Return observations (N, entries) float32 of ``Runs``, clipped to their bounds."""
+        filled = [block.fill(runs.state.estimate) for block in self._own]
+        filled += [block.fill(runs.beliefs()) for block in self._memory]
+        filled += [block.fill(runs) for block in self._network]
+        xp = namespace(runs.tokens)
         rows = xp.concatenate(filled, dtype=np.float64)
         if xp is not np:
             return xp.clip(rows.T.astype(np.float32), self.low, self.high)

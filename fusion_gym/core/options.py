@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import declaration
 from fusion_gym.arrays import Array
+from fusion_gym.core.channel import Channel
+from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.noise import NoiseSource
-from fusion_gym.core.system import System
+from fusion_gym.core.plant import Plant
 from fusion_gym.errors import refusal
 from fusion_gym.fusion.table import Structure
 from fusion_gym.importing import name_of
@@ -174,41 +176,45 @@ class PaperOptions(CommonOptions):
 
 @dataclass(frozen=True)
 class Scenario:
-    """The system and the defaults that an environment builds from its options.
+    """The parts and the defaults that an environment builds from its options.
 
     Args:
         options: The options.
-        system: The system.
+        plant: The truth and its sensors.
+        estimator: The local filters and the fusion centre.
         state_weights: Weights (n,) of the squared errors in the reward if the options have none;
             ``None`` weighs all states equally. ``reward_scale`` multiplies them.
         policy_defaults: Parameters of named policies in this scenario.
         feedback: Whether every node receives the centre's estimate by construction.
-        memory_system: System on the same noise whose filter processes the unsent measurements;
-            ``None`` is ``system``.
+        memory_estimator: Estimator of the unsent measurements; ``None`` is ``estimator``.
         nodes_have_memory: Whether a packet holds all past measurements of its node, so that no
-            ``memory_system`` is needed.
+            ``memory_estimator`` is needed.
         no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
         required_policy: The policy whose silence the filter reads, or ``None``.
-        noise: Source of the noise; ``None`` draws standard normals.
+        noise: Source of the plant's noise; ``None`` draws standard normals.
+        channel: Losses of the network; ``None`` loses nothing.
 
     Example:
         >>> import fusion_gym
-        >>> system = fusion_gym.make_task("fusion_gym/TobitOscillator-v1").system
-        >>> scenario = fusion_gym.Scenario(fusion_gym.CommonOptions(), system, state_weights=[2, 1])
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
+        >>> options = fusion_gym.CommonOptions()
+        >>> scenario = fusion_gym.Scenario(options, task.plant, task.estimator)
         >>> scenario.feedback
         False
     """
 
     options: CommonOptions
-    system: System[Any]
+    plant: Plant[Any]
+    estimator: Estimator[Any]
     state_weights: ArrayLike | None = None
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
     feedback: bool = False
-    memory_system: System[Any] | None = None
+    memory_estimator: Estimator[Any] | None = None
     nodes_have_memory: bool = False
     no_estimates: str | None = None
     required_policy: str | None = None
     noise: NoiseSource | None = None
+    channel: Channel | None = None
 
 
 def plain_options(value: Any) -> Any:

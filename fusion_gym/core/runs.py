@@ -12,14 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.access import access_mask, first_request
+from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.beliefs import Beliefs, Estimate
+from fusion_gym.core.estimator import Reception
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory
-from fusion_gym.core.observation import NetworkState, ObservationLayout
-from fusion_gym.core.system import Signals
+from fusion_gym.core.network import NetworkState
+from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
-from fusion_gym.core.token_bucket import Grants, Queue
+from fusion_gym.core.token_bucket import Grants
 from fusion_gym.namespace import namespace
 
 
@@ -52,26 +53,37 @@ class Outcome(NamedTuple):
     ended: NDArray[np.bool_]
 
 
-class Position(NamedTuple):
-    """The state of N runs after sensing.
+class State(NamedTuple):
+    """The states of plant, estimator and network of N runs after sensing.
 
     Attributes:
-        state: The system's state.
-        tokens: (N,).
+        plant: The plant's state.
+        estimate: The estimator's state after observing.
+        network: The network's state before the requests.
+        history: For late packets, the estimator's state before the update, the measurements and the
+            arrivals (sensors, N) of the last steps, oldest first.
+    """
+
+    plant: Any
+    estimate: Any
+    network: NetworkState
+    history: tuple[tuple[Any, Array, NDArray[np.bool_]], ...] = ()
+
+
+class Position(NamedTuple):
+    """N runs at one time, after sensing.
+
+    Attributes:
+        state: The states of plant, estimator and network.
         price: Price of a token (N,).
         steps: Steps taken (N,).
         limit: Step at which the episode ends (N,).
-        queue: Place of each sensor in the queue (sensors, N).
-        admitted: Sensors that the access rule admits in the coming step (sensors, N) bool.
     """
 
-    state: Any
-    tokens: Array
+    state: State
     price: Array
     steps: NDArray[np.int64]
     limit: NDArray[np.int64]
-    queue: Queue
-    admitted: NDArray[np.bool_]
 
 
 class Lazy:
@@ -103,89 +115,105 @@ class Runs:
         layout: Layout of the observation.
 
     Attributes:
-        tokens: (N,).
         price: Price of a token (N,).
         steps: Steps taken (N,).
-        queue: Place of each sensor in the queue (sensors, N).
+        limit: Step at which the episode ends (N,).
     """
 
-    tokens: Array
     price: Array
     steps: NDArray[np.int64]
-    queue: Queue
-    _limit: NDArray[np.int64]
+    limit: NDArray[np.int64]
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self.task, self.memory, self.layout = task, memory, layout
-        self._silence = task.system.offers("with_possible")
-        self._gaps = task.system.offers("available")
         self._delivered: Any = None
 
     @property
-    def state(self) -> Any:
-        """The system's state after sensing."""
-        return value_of(self._state)
+    def state(self) -> State:
+        """The states of plant, estimator and network after sensing."""
+        state: State = value_of(self._state)
+        return state
 
     @state.setter
-    def state(self, state: Any) -> None:
-        self._state = state
+    def state(self, state: State | None) -> None:
+        self._state: Any = state
 
     @property
-    def delivered(self) -> Any:
-        """The system's state after the last delivery, for metrics and figures."""
-        return value_of(self._delivered)
+    def delivered(self) -> State:
+        """The states after the last delivery, for metrics and figures."""
+        delivered: State = value_of(self._delivered)
+        return delivered
+
+    @property
+    def tokens(self) -> Array:
+        """Tokens (N,)."""
+        return self.state.network.tokens
 
     @property
     def channels(self) -> int:
-        """Number of standard normals of a step: the system's, and one for ``access="random"``."""
-        return self.task.system.noise_channels + (self.task.access == "random")
+        """Number of standard normals of a step: the plant's, then the network's."""
+        return self.task.plant.noise_channels + self.task.network.noise_channels
 
     def deliver(self, requests: NDArray[np.bool_]) -> Outcome:
         """Make the first half of a step with requests (sensors, N): grant, update, fuse, reward."""
-        task, system = self.task, self.task.system
-        granted, spent, tokens, self.queue = self.answer(requests)
-        state = self.state
-        if self._silence:
-            state = system.with_possible(state, self._possible(granted, spent))
-        state = self.memory.deliver(self.state, system.deliver(state, granted), granted)
-        mean, covariance = system.fused(state)
-        error = system.truth(state) - mean
-        if self._gaps:
-            error = np.where(system.available(state)[1], error, 0.0)
+        task, state, estimator = self.task, self.state, self.task.estimator
+        available, requested = task.plant.available(state.plant), requests
+        if available is not None:
+            requests = requests & available[0]
+        network, delivery = task.network.deliver(state.network, requests, estimator.reads_silence)
+        (arrived, possible, failure), spent = delivery.reception, delivery.spent
+        if available is not None and possible is not None:
+            possible = possible & available[0]
+        history = state.history
+        if network.due is not None:
+            last = state.estimate, task.plant.measurement(state.plant), arrived
+            history = (*history, last)[-len(network.due) :]
+        estimate = estimator.update(state.estimate, Reception(arrived, possible, failure))
+        if task.packet == "estimate":
+            best, spread = self.beliefs().best
+            estimate = estimator.adopt(estimate, best[0], spread[0], np.asarray(arrived.any(0)))
+        self.memory.update(self.beliefs, arrived)
+        error = task.plant.truth(state.plant) - estimator.mean(estimate)
+        if available is not None:
+            error = np.where(available[1], error, 0.0)
         squared_error = error * error
+        covariance = estimator.covariance(estimate)
         reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
-        self._delivered, self.tokens, self.steps = state, tokens, self.steps + 1
+        self._delivered = State(state.plant, estimate, network, history)
+        self.steps = self.steps + 1
         return Outcome(
             reward=reward_error + reward_communication,
             reward_error=reward_error,
             reward_communication=reward_communication,
             cost=spent,
-            requested=requests,
-            granted=granted,
+            requested=requested,
+            granted=delivery.granted,
             error=error,
             squared_error=squared_error,
             diverged=namespace(squared_error)
             .logical_not(squared_error <= task.divergence_level)
             .any(0),
-            ended=self.steps >= self._limit,
+            ended=self.steps >= self.limit,
         )
 
     def answer(
         self, requests: NDArray[np.bool_], runs: NDArray[np.int64] | slice = slice(None)
     ) -> Grants:
         """Return the grants for requests (sensors, R) of the R ``runs``."""
-        queue = self.queue[:, runs]
-        if self._gaps or self.task.access in ("round_robin", "random"):
-            requests = requests & self.admitted()[:, runs]
-        if self.task.access == "single":
-            requests = first_request(requests, queue)
-        return self.task.bucket.grant(self.tokens[runs], requests, queue)
+        state, available = self.state, self.task.plant.available(self.state.plant)
+        if available is not None:
+            requests = requests & available[0][:, runs]
+        return self.task.network.grant(state.network, requests, runs)
 
     def sense(self, noise: Array) -> None:
-        """Make the second half of a step: move the plant and measure, with noise (channels, N)."""
-        noise = noise[: self.task.system.noise_channels]
-        self.memory.sense(noise)
-        self.state = self.task.system.sense(self._delivered, noise)
+        """Make the second half of a step: move plant and network, measure, predict and observe.
+
+        Args:
+            noise: Standard normals (channels, N).
+        """
+        state = advance(self.task, settle(self.task, self.delivered), noise, self.steps)
+        self.memory.observe(self.task.plant.measurement(state.plant))
+        self.state = state
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
         """Return independent copies of ``runs``, possibly repeated, by default of all."""
@@ -201,90 +229,84 @@ class Runs:
         Args:
             runs: Numbers of the runs.
         """
-        position = self.position(runs)
-        memory = self.memory.with_best(position.state, take_runs(self.beliefs().best, runs))
-        return Branch(self.task, memory, self.layout, position)
+        branch = Branch(self.task, self.memory.with_states({}), self.layout, self.position(runs))
+        branch.set_best(take_runs(self.beliefs().best, runs))
+        return branch
 
     def position(self, runs: NDArray[np.int64] | None = None) -> Position:
-        """Return the state of ``runs``, possibly repeated, by default of all."""
+        """Return the states of ``runs``, possibly repeated, by default of all."""
+        whole = Position(self.state, self.price, self.steps, self.limit)
         if runs is None:
-            return Position(
-                self.state,
-                self.tokens.copy(),
-                self.price.copy(),
-                self.steps.copy(),
-                self._limit.copy(),
-                self.queue,
-                self.admitted(),
-            )
-        return Position(
-            take_runs(self.state, runs),
-            self.tokens[runs],
-            self.price[runs],
-            self.steps[runs],
-            self._limit[runs],
-            self.queue[:, runs],
-            self.admitted()[:, runs],
-        )
+            return whole._replace(steps=self.steps.copy(), limit=self.limit.copy())
+        result: Position = take_runs(whole, runs)
+        return result
 
     def observe(self) -> NDArray[np.float32]:
         """Return new observations (N, entries) of all runs."""
-        left = (self._limit - self.steps).astype(np.float64)
-        network = NetworkState(self.tokens, self.admitted, self.price, left, self.queue)
-        return self.layout.encode(self.state, network, self.beliefs)
+        return self.layout.encode(self)
 
     def beliefs(self) -> Beliefs:
         """Return the beliefs of the memory's owner before any transmission."""
-        return self.memory.beliefs(self.state)
+        return self.memory.beliefs(self.state.estimate, self.arrival_probability())
+
+    def arrival_probability(self) -> Array | None:
+        """Return the probability (sensors, N) that a packet sent now arrives; ``None`` is 1."""
+        return self.task.network.arrival_probability(self.state.network)
 
     def admitted(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) with a reading that the access rule now admits."""
-        return self._mask(self._lottery())
+        available = self.task.plant.available(self.state.plant)
+        admitted = self.state.network.admitted
+        return admitted if available is None else admitted & available[0]
+
+    def channel_state(self) -> NDArray[np.int64]:
+        """Return the state (sensors, N) of each channel at the step before, 0 without states."""
+        known, queue = self.state.network.channel, self.state.network.queue
+        return np.zeros(queue.shape, dtype=np.int64) if known is None else known
 
     def grantable(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) whose single request the network would grant now."""
-        return self.admitted() & self.task.bucket.affordable(self.tokens)
+        return self.admitted() & self.task.network.bucket.affordable(self.tokens)
+
+    def read(self) -> dict[str, Any]:
+        """Return the estimator's signals, with the network's probability of an arrival."""
+        arrival = self.arrival_probability()
+        failure = None if arrival is None else 1.0 - arrival
+        values = dict(self.task.estimator.read(self.state.estimate, failure))
+        reduction: Any = values.get("variance_reduction")
+        if arrival is not None and reduction is not None:
+            values |= {
+                "variance_reduction": lambda: (
+                    arrival * (reduction() if callable(reduction) else reduction)
+                )
+            }
+        return values
 
     def signals(self) -> Signals:
         """Return the signals of all runs, except those that the information mode withholds.
 
-        The system's signals are extended by ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price``
-        (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor granted least
-        recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N) bool,
-        ``observation`` (N, entries), ``model`` (the system's state from :meth:`System.visible
-        <fusion_gym.core.system.System.visible>`) and the beliefs (:mod:`fusion_gym.core.signals`).
+        The estimator's signals are extended by ``tokens`` (N,), ``token_cost`` (sensors, 1),
+        ``price`` (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor
+        granted least recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N)
+        bool, ``channel_state`` (sensors, N), ``observation`` (N, entries), ``estimate`` (the
+        estimator's state) and the beliefs (:mod:`fusion_gym.core.signals`).
         """
-        system, state = self.task.system, self.state
-        values = dict(system.read(state))
+        network, values = self.state.network, self.read()
         values |= {
-            "tokens": self.tokens,
-            "token_cost": self.task.bucket.cost,
+            "tokens": network.tokens,
+            "token_cost": self.task.network.bucket.cost,
             "price": self.price,
             "step": self.steps,
-            "queue": self.queue,
+            "queue": network.queue,
             "start": self.steps == 0,
             "admitted": self.admitted,
             "grantable": self.grantable,
+            "channel_state": self.channel_state,
             "observation": self.observe,
-            "model": lambda: system.visible(state),
+            "estimate": self.state.estimate,
         }
         values |= self.memory.signals(self.beliefs)
         return Signals(values, self.task.hidden_signals, self.memory.missing_signals)
-
-    def _possible(self, granted: NDArray[np.bool_], spent: Array) -> NDArray[np.bool_]:
-        """Return the sensors (sensors, N) whose request the network would also have granted."""
-        bucket = self.task.bucket
-        tokens = self.tokens if bucket.sharing == "equal" else self.tokens - spent
-        possible = self.admitted() & bucket.affordable(tokens)
-        return possible & ~granted.any(0) if self.task.access == "single" else possible
-
-    def _mask(self, lottery: Array | None) -> NDArray[np.bool_]:
-        admitted = access_mask(self.task.access, self.task.sensors, self.steps, lottery)
-        return admitted & self.task.system.available(self.state)[0] if self._gaps else admitted
-
-    def _lottery(self) -> Array | None:
-        """Return the standard normals (N,) for random access, or ``None`` with another rule."""
-        return None
 
 
 class Branch(Runs):
@@ -294,8 +316,7 @@ class Branch(Runs):
         self, task: Task, memory: Memory, layout: ObservationLayout, position: Position
     ) -> None:
         super().__init__(task, memory, layout)
-        self.state, self.tokens, self.price = position[:3]
-        self.steps, self._limit, self.queue, self._admitted = position[3:]
+        self.state, self.price, self.steps, self.limit = position
 
     def step(
         self, requests: NDArray[np.bool_], noise: Array, best: Estimate | None = None
@@ -310,14 +331,72 @@ class Branch(Runs):
         outcome = self.deliver(requests)
         self.sense(noise)
         if best is not None:
-            self.memory = self.memory.with_best(self.state, best)
+            self.set_best(best)
         return outcome
 
-    def sense(self, noise: Array) -> None:
-        """Make the second half of a step with noise (channels, N)."""
-        super().sense(noise)
-        self._admitted = self._mask(noise[-1] if self.task.access == "random" else None)
+    def set_best(self, best: Estimate) -> None:
+        """Set a known x* of the present time."""
+        arrival = self.arrival_probability()
+        self.memory = self.memory.with_best(self.state.estimate, arrival, best)
 
-    def admitted(self) -> NDArray[np.bool_]:
-        """Return the sensors (sensors, N) with a reading that the access rule now admits."""
-        return self._admitted
+
+def start_of(task: Task, noise: Array) -> tuple[State, Any]:
+    """Return the states at time 0, and what the plant announces.
+
+    Args:
+        task: The task.
+        noise: Standard normals of the starts of plant and network.
+    """
+    own = task.plant.start_channels
+    plant, announcement = task.plant.start(noise[:own])
+    estimate = task.estimator.start(task.plant.measurement(plant), announcement)
+    return State(plant, estimate, task.network.start(noise[own:])), announcement
+
+
+def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) -> State:
+    """Return the states after the next sensing.
+
+    Args:
+        task: The task.
+        state: States after a delivery, or at time 0.
+        noise: Standard normals (channels, N).
+        steps: Steps taken (N,).
+    """
+    own = task.plant.noise_channels
+    plant = task.plant.sense(state.plant, noise[:own])
+    predicted = task.estimator.predict(state.estimate)
+    estimate = task.estimator.observe(predicted, task.plant.measurement(plant))
+    network = task.network.advance(state.network, noise[own:], steps)
+    return State(plant, estimate, network, state.history)
+
+
+def settle(task: Task, state: State) -> State:
+    """Return the states after late packets, by new updates from the step of the oldest one on.
+
+    Args:
+        task: The task.
+        state: States after a delivery.
+    """
+    late = task.network.late(state.network)
+    if late is None or not late.any():
+        return state
+    oldest = late.any(1).cumsum(0).argmax(0) + 1  # the last step back at which the count rises
+    every, estimator = late.any((0, 1)), task.estimator
+    for back in range(1, len(late) + 1):
+        runs = np.flatnonzero(every & (oldest == back))
+        if not runs.size:
+            continue
+        parts, estimate = take_runs(state.history[-back:], runs), None
+        history = []
+        for steps, (before, measurement, arrived) in zip(range(back, 0, -1), parts, strict=True):
+            if estimate is not None:
+                before = estimator.observe(estimator.predict(estimate), measurement)
+            arrived = arrived | late[steps - 1][:, runs]
+            estimate = estimator.update(before, Reception(arrived))
+            history.append((before, measurement, arrived))
+        settled = merge_runs(state.history[-back:], tuple(history), runs)
+        state = state._replace(
+            estimate=merge_runs(state.estimate, estimate, runs),
+            history=state.history[:-back] + settled,
+        )
+    return state

@@ -72,12 +72,13 @@ def sustained_rate(bucket: TokenBucket, access: str) -> float:
 
 def sustained_tokens(task: Task) -> float:
     """Return the tokens per step that the network lets all sensors spend in the long run."""
-    return sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
+    bucket = task.network.bucket
+    return sustained_rate(bucket, task.network.access) * float(bucket.cost.sum())
 
 
 def nominal_error(task: Task) -> Array:
     """Return each state's mean squared error (n,) with requests at an even pace."""
-    rate, sensors = nominal_rate(task.bucket, task.access), task.sensors
+    rate, sensors = nominal_rate(task.network.bucket, task.network.access), task.sensors
     if rate == 0.0:
         return task.open_loop[:, 0]
     batch = _batch(task, _RUNS, 1)
@@ -101,7 +102,7 @@ def price_range(task: Task) -> tuple[float, float]:
         task: The task.
     """
     sustained = sustained_tokens(task)
-    least = _PACKETS * float(task.bucket.cost.sum()) / task.horizon
+    least = _PACKETS * float(task.network.bucket.cost.sum()) / task.horizon
     shares = np.array([sustained * _MOST, max(sustained * _LEAST, least)])
     low, high = prices_at(*_sweep(task), shares).tolist()
     return _rounded(low), _rounded(max(high, 2.0 * low))
@@ -130,9 +131,9 @@ def _sweep(task: Task) -> tuple[Array, Array]:
     runs = int(np.clip(_RUNS * share, 4, _RUNS))
     ratio, count = (2, 21) if runs > 4 else (4, 9)
     usual = task.error_scale * float((task.relative_weights[:, 0] * nominal_error(task)).sum())
-    levels = usual / float(task.bucket.cost.mean()) * np.geomspace(3e-3, 3e2, count)
+    levels = usual / float(task.network.bucket.cost.mean()) * np.geomspace(3e-3, 3e2, count)
     counts = ratio ** np.arange(1 + int(math.log(task.sensors, ratio)))
-    least = np.tile(np.repeat(levels, runs), len(counts)) * task.bucket.cost
+    least = np.tile(np.repeat(levels, runs), len(counts)) * task.network.bucket.cost
     most = np.repeat(counts, len(levels) * runs)
     batch = _batch(task, runs, len(levels) * len(counts))
     total = np.zeros((2, len(most)))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fusion_gym.core.beliefs import Beliefs, Owner
-from fusion_gym.core.system import Signal
+from fusion_gym.core.knowledge import Signal
 
 # Knowledge in a task with memory; without memory "scheduler" and "own" suffice.
 MEMORY_SIGNALS = (
@@ -23,9 +23,18 @@ MEMORY_SIGNALS = (
     Signal("own_difference", "own_memory", "(sensors, n, N)", "x* − x̂ of each sensor"),
     Signal("own_value", "own_memory", "(sensors, N)", "v(m) of each sensor"),
 )
+NETWORK_SIGNALS = (
+    Signal(
+        "channel_state",
+        "centre",
+        "(sensors, N)",
+        "state of the channel at the step before: 0 bad, 1 good",
+        "own",
+    ),
+)
 # For policies that plan, and for saved agents.
 PLANNING_SIGNALS = (
-    Signal("model", "scheduler", "a state", "the system's state without hidden parts"),
+    Signal("estimate", "scheduler", "a state", "the estimator's state"),
     Signal("beliefs", "scheduler_memory", "beliefs", "the scheduler's belief of the state"),
     Signal("own_beliefs", "own_memory", "beliefs", "each sensor's belief of the state"),
 )

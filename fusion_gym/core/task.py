@@ -1,4 +1,4 @@
-"""A task: a system, its network, the knowledge of a policy, and the reward."""
+"""A task: plant, estimator, network, the knowledge of a policy, and the reward."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.admission import admit
 from fusion_gym.core.communication import communication
+from fusion_gym.core.estimator import Estimator
+from fusion_gym.core.knowledge import Knowledge, covers, least_covering
 from fusion_gym.core.nature import Nature
+from fusion_gym.core.network import Network
 from fusion_gym.core.noise import NoiseSource
 from fusion_gym.core.options import Action, Backend, CommonOptions, Scenario, plain_options
+from fusion_gym.core.plant import Plant
 from fusion_gym.core.reward import Price, Reward
-from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
 
 # Knowledge class of each information mode.
@@ -27,7 +29,7 @@ ACTION_KINDS: tuple[str, ...] = get_args(Action)
 BACKENDS: tuple[str, ...] = get_args(Backend)
 # Additional signals that need the sensors' measurements.
 SENSORS_ONLY = (
-    "model", "beliefs", "belief_difference", "transmission_value", "own_beliefs",
+    "estimate", "beliefs", "belief_difference", "transmission_value", "own_beliefs",
     "own_difference", "own_value",
 )  # fmt: skip
 _MOST_DISCRETE = 16  # sensors with a discrete action of 2^sensors values
@@ -38,19 +40,19 @@ class Task:
     """The definition of an environment, independent of the number of runs.
 
     Args:
-        system: The system.
-        bucket: The token bucket.
+        plant: The truth and its sensors.
+        estimator: The local filters and the fusion centre.
+        network: Medium access, tokens, losses and delays.
         reward: The reward.
         horizon: Steps of an episode.
         information: Content of the observation: ``"sensors"`` (all new measurements) or
             ``"centre"`` (the fusion centre's knowledge before any transmission).
-        action: ``"binary"`` (one bit u_m per sensor) or ``"discrete"`` (the number Σ u_m 2^m).
-        access: Rule of :mod:`fusion_gym.core.access`. With ``"single"`` the action is 0 for no
-            request or m + 1 for sensor m.
+        action: ``"binary"`` (one bit u_m per sensor) or ``"discrete"`` (the number Σ u_m 2^m). With
+            access ``"single"`` it is 0 for no request or m + 1 for sensor m.
         packet: Content of a packet: ``"measurement"`` or ``"estimate"``.
         broadcast: ``"none"``, ``"estimate"`` or ``"packets"`` (:mod:`fusion_gym.core.memory`).
         memory: Whether the scheduler or each local sensor has memory.
-        memory_system: System whose filter is the memory.
+        memory_estimator: Estimator of the memory.
         belief_features: Observation entries of the beliefs, ``"difference"`` and ``"value"``.
         feedback: Whether the nodes receive the centre's estimate.
         clock: Whether the observation shows the steps left, so that an episode ends by termination.
@@ -62,7 +64,8 @@ class Task:
         settings: The user's options, for reports.
         policy_defaults: The scenario's parameters of named policies.
         required_policy: The only policy that may run, or ``None``.
-        noise: Source of the noise, such as windows of a recording; ``None`` draws standard normals.
+        noise: Source of the plant's noise, such as windows of a recording; ``None`` draws
+            standard normals.
 
     Raises:
         ConfigurationError: A mode is unknown, the horizon is below 1, or the parts do not fit.
@@ -74,17 +77,17 @@ class Task:
         (3, 50, 'sensors')
     """
 
-    system: System[Any]
-    bucket: TokenBucket
+    plant: Plant[Any]
+    estimator: Estimator[Any]
+    network: Network
     reward: Reward
     horizon: int
     information: str = "sensors"
     action: str = "binary"
-    access: str = "any"
     packet: str = "measurement"
     broadcast: str = "none"
     memory: bool = False
-    memory_system: System[Any] | None = None
+    memory_estimator: Estimator[Any] | None = None
     belief_features: tuple[str, ...] = ()
     feedback: bool = False
     clock: bool = False
@@ -101,26 +104,29 @@ class Task:
         validation.horizon(self.horizon)
         validation.choice("information", self.information, INFORMATION_MODES)
         validation.choice("action", self.action, ACTION_KINDS)
-        validation.choice("access", self.access, ACCESS_RULES)
         validation.choice("backend", self.backend, BACKENDS)
-        if len(self.bucket.cost) != self.system.sensor_count:
+        if self.network.sensors != self.plant.sensor_count:
             raise validation.ConfigurationError(
-                f"token_cost for {len(self.bucket.cost)} sensors is not allowed: the system has "
-                f"{self.system.sensor_count}"
+                f"token_cost for {self.network.sensors} sensors is not allowed: the plant has "
+                f"{self.plant.sensor_count}"
             )
         if self.required_policy is not None and self.information == "centre":
             why = f"with the policy {self.required_policy!r}, which reads the new measurements"
             raise validation.refusal("information", "centre", "'sensors'", why)
-        if self.action == "discrete" and self.access != "single" and self.sensors > _MOST_DISCRETE:
+        many = self.network.access != "single" and self.sensors > _MOST_DISCRETE
+        if self.action == "discrete" and many:
             raise validation.ConfigurationError(
                 f"action = 'discrete' is not allowed with {self.sensors} sensors: it numbers all "
                 f"sets of requests, so it allows at most {_MOST_DISCRETE} sensors"
             )
-        states = len(self.system.state_names)
+        if len(self.network.delay) > 1 and self.packet == "estimate":
+            where = "with packet='estimate'"
+            raise validation.refusal("delay", self.network.delay, "none", where)
+        states = len(self.plant.state_names)
         if self.reward.state_weights.shape != (states, 1):
             raise validation.ConfigurationError(
                 f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
-                f"system has {states} states, so its shape must be ({states}, 1)"
+                f"plant has {states} states, so its shape must be ({states}, 1)"
             )
         if self.backend == "jax":
             self._refuse_jax()
@@ -140,14 +146,18 @@ class Task:
         Raises:
             ConfigurationError: A value is not allowed.
         """
-        options, system = scenario.options, scenario.system
-        if not isinstance(system, System):
-            allowed = "an instance of fusion_gym.core.system.System"
-            raise validation.refusal("system", system, allowed)
-        if system.nature != (nature := Nature.create(options)):
-            nature.refuse("here", f"the truth of {type(system).__name__} is its model")
+        options, plant = scenario.options, scenario.plant
+        for name, part, kind in (
+            ("plant", plant, Plant),
+            ("estimator", scenario.estimator, Estimator),
+        ):
+            if not isinstance(part, kind):
+                allowed = f"an instance of {kind.__module__}.{kind.__name__}"
+                raise validation.refusal(name, part, allowed)
+        if plant.nature != (nature := Nature.create(options)):
+            nature.refuse("here", f"the truth of {type(plant).__name__} is its model")
         horizon = validation.horizon(options.horizon)
-        weights, open_loop = options.state_weights, admit(system, horizon)
+        weights, open_loop = options.state_weights, admit(plant, horizon)
         weights = scenario.state_weights if weights is None else weights
         if options.reward_scale is not None:
             factor = validation.number("reward_scale", options.reward_scale, above=0.0)
@@ -162,17 +172,19 @@ class Task:
         )
         how = communication(scenario)
         return cls(
-            system=system,
-            bucket=make_bucket(options, system.sensor_count),
+            plant=plant,
+            estimator=scenario.estimator,
+            network=Network(
+                make_bucket(options, plant.sensor_count), options.access, scenario.channel
+            ),
             reward=reward,
             horizon=horizon if limit is None else min(horizon, limit),
             information=options.information,
             action=options.action,
-            access=options.access,
             packet=options.packet,
             broadcast=how.broadcast,
             memory=options.memory,
-            memory_system=how.memory_system,
+            memory_estimator=how.memory_estimator,
             belief_features=how.features,
             feedback=scenario.feedback,
             clock=options.clock,
@@ -195,12 +207,12 @@ class Task:
     @property
     def sensors(self) -> int:
         """Number of sensors."""
-        return self.system.sensor_count
+        return self.plant.sensor_count
 
     @functools.cached_property
     def open_loop(self) -> Array:
         """Mean error variances (n, 1) without any delivery."""
-        return self.system.open_loop(self.horizon)[:, None]
+        return self.plant.open_loop(self.horizon)[:, None]
 
     @functools.cached_property
     def divergence_level(self) -> Array:
@@ -222,19 +234,20 @@ class Task:
     @property
     def hidden_signals(self) -> tuple[str, ...]:
         """Names of the signals that the information mode withholds."""
-        signals = self.system.signals
+        signals = self.estimator.signals
         hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
         return (*hidden, *(() if covers(self.knowledge, "scheduler") else SENSORS_ONLY))
 
     def _refuse_jax(self) -> None:
         """Refuse options that do not run under JAX."""
-        system, kind = self.system, type(self.system).__name__
-        fields = [system.numpy_only] if system.numpy_only else []
-        fields += [*system.nature.departing, *(["memory"] if self.memory else [])]
+        kind, own = type(self.estimator).__name__, (self.plant, self.estimator)
+        fields = [part.numpy_only for part in own if part.numpy_only is not None]
+        fields += [*self.plant.nature.departing, *(["memory"] if self.memory else [])]
         fields += ["belief_features"] if self.belief_features else []
+        fields += ["delay"] if len(self.network.delay) > 1 else []
         fields += ["error"] if callable(self.reward.error) else []
         if "system" in fields:
-            raise validation.refusal("system", kind, "a system that JAX runs", "under JAX")
+            raise validation.refusal("system", kind, "an estimator that JAX runs", "under JAX")
         if fields:
             value = self.settings.get(fields[0])
             raise validation.refusal(fields[0], value, "the default", "under JAX")

@@ -53,7 +53,7 @@ class Film:
         self._window = min(task.horizon if steps is None else steps, WINDOW)
         self._steps: deque[_Step] = deque(maxlen=self._window)
         self._ages = np.zeros(runs, dtype=np.int64)  # steps of each run's episode
-        self._state_names = task.system.state_names[:_MOST_STATES]
+        self._state_names = task.plant.state_names[:_MOST_STATES]
         self._figure: Any = None  # created by the first frame
 
     def begin(self, runs: NDArray[np.int64] | None = None) -> None:
@@ -109,9 +109,10 @@ class Film:
 
     def _series(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
         """Return truth, fused estimate and two claimed deviations, each (steps, shown)."""
-        system, visible = self.task.system, len(self._state_names)
-        fused = [system.fused(step.state) for step in steps]
-        truth = np.array([system.truth(step.state)[:visible, run] for step in steps])
+        plant, estimator, visible = self.task.plant, self.task.estimator, len(self._state_names)
+        estimates = [step.state.estimate for step in steps]
+        fused = [(estimator.mean(own), estimator.covariance(own)) for own in estimates]
+        truth = np.array([plant.truth(step.state.plant)[:visible, run] for step in steps])
         mean = np.array([value[0][:visible, run] for value in fused])
         variance = np.array([linalg.diagonal(value[1])[:visible, run] for value in fused])
         truth, mean, variance = (part.reshape(-1, visible) for part in (truth, mean, variance))
@@ -140,7 +141,9 @@ class Film:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        ratios = [_STATE] * len(self._state_names) + [_STRIP] * (2 - self.task.bucket.unlimited)
+        ratios = [_STATE] * len(self._state_names) + [_STRIP] * (
+            2 - self.task.network.bucket.unlimited
+        )
         height = _TOP + _BOTTOM + sum(ratios)
         self._figure = Figure(figsize=(_WIDTH / 100, height / 100), dpi=100)
         self._canvas = FigureCanvasAgg(self._figure)
@@ -152,7 +155,7 @@ class Film:
             )
         )  # fmt: skip
         self._curves: list[list[Any]] = []
-        limits = self.task.system.censored_beyond
+        limits = self.task.plant.censored_beyond
         for place, (name, axis) in enumerate(zip(self._state_names, self._axes, strict=False)):
             (truth,) = axis.plot([], [], color=_TRUTH, lw=1.4, label="state")
             (mean,) = axis.plot([], [], color=_ESTIMATE, lw=1.4, label="fused estimate")
@@ -167,7 +170,7 @@ class Film:
                 axis.axhspan(high, 1e9, color=_CENSORED, alpha=0.15, lw=0, label=label)
             axis.set_ylabel(name)
             self._curves.append([truth, mean, band])
-        sensors, bucket = self.task.sensors, self.task.bucket
+        sensors, bucket = self.task.sensors, self.task.network.bucket
         requests = self._axes[len(self._state_names)]
         (granted,) = requests.plot([], [], "|", color=_GRANTED, ms=9, mew=2, label="granted")
         (denied,) = requests.plot([], [], "x", color=_DENIED, ms=5, label="denied")

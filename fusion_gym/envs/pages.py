@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fusion_gym.core.communication import FEATURES
+from fusion_gym.core.knowledge import Block, covers, numbered
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import (
     belief_blocks,
@@ -13,7 +14,6 @@ from fusion_gym.core.observation import (
 )
 from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.reward import Price
-from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import list_options, options_in, short
@@ -61,7 +61,7 @@ def page(env_id: str, task: Task | None = None) -> str:
     """
     kind = options_of(env_id)
     task = make_task(env_id) if task is None else task
-    system, view = task.system, make_view(task)
+    plant, view = task.plant, make_view(task)
     description = _paragraphs(kind) or [env_id]
     versions = [text for text in description if re.match(r"v\d+: ", text)]
     if kind.__module__.startswith("fusion_gym."):
@@ -70,14 +70,14 @@ def page(env_id: str, task: Task | None = None) -> str:
     return _PAGE.read_text(encoding="utf-8").format(
         description="\n\n".join(text for text in description if not re.match(r"v\d+: ", text)),
         actions=view.actions,
-        action=_ACTIONS["single" if task.access == "single" else task.action],
+        action=_ACTIONS["single" if task.network.access == "single" else task.action],
         entries=len(view.names),
         sensors=task.sensors,
-        states=", ".join(system.state_names),
+        states=", ".join(plant.state_names),
         legend=LEGEND,
         table=observation_table(task),
         weights=short(weights),
-        open_loop=f"{float(weights @ system.open_loop(task.horizon)):.3g}",
+        open_loop=f"{float(weights @ plant.open_loop(task.horizon)):.3g}",
         horizon=task.horizon,
         options=kind.__name__,
         arguments="\n".join(f"    {plain_marks(line)}" for line in list_options(options_in(kind))),
@@ -92,9 +92,9 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
         task: The task.
         *others: Names and tasks of the same environment; their additional blocks carry the name.
     """
-    rows = {block.name: _row(task, block) for block in task.system.observation}
+    rows = {block.name: _row(task, block) for block in task.estimator.observation}
     for name, other in others:
-        for block in other.system.observation:
+        for block in other.estimator.observation:
             rows.setdefault(block.name, _row(other, block, f"only with {name}"))
     with_memory = replace(task, memory=True, belief_features=task.belief_features or FEATURES)
     for owner, condition in _BELIEFS.items():
@@ -103,8 +103,13 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
             rows[block.name] = _row(task, block, "" if visible else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
-    turns = replace(task.bucket, sharing="turns", unlimited=False)
-    network = replace(task, access="round_robin", bucket=turns, clock=True, reward=price)
+    turns = replace(task.network.bucket, sharing="turns", unlimited=False)
+    network = replace(
+        task,
+        network=replace(task.network, access="round_robin", bucket=turns),
+        clock=True,
+        reward=price,
+    )
     for block in network_blocks(network):
         rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])
     return table(("entries", "range", "a sensor observes", "meaning"), rows.values())
@@ -138,6 +143,6 @@ def _axis(task: Task, block: Block, place: int) -> str:
     labels = block.labels[place]
     if place == 0 and (block.node == "own" or labels == numbered(task.sensors)):
         return "sensor"
-    if labels == task.system.state_names:
+    if labels == task.plant.state_names:
         return "state"
     return "component" if place and labels == numbered(len(labels)) else "/".join(labels)

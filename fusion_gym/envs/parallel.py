@@ -113,7 +113,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         outcome = self.batch.step(self.view.requests(selection, None))
         reward, ended = float(outcome.reward[0]), bool(outcome.ended[0])
         agents = self.agents
-        costs = outcome.granted[:, 0] * self.task.bucket.cost[:, 0]
+        costs = outcome.granted[:, 0] * self.task.network.bucket.cost[:, 0]
         infos = {
             agent: {"granted": bool(outcome.granted[sensor, 0]), "cost": float(costs[sensor])}
             for sensor, agent in enumerate(agents)

@@ -13,9 +13,9 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.alternatives import alternatives
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.reward import TRAINING_ERRORS
 from fusion_gym.core.runs import Outcome
-from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
@@ -47,8 +47,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         error: Error term of the rewards: ``"squared"`` is the task's own, ``"excess"`` and
             ``"mismatch"`` are defined in :meth:`~fusion_gym.core.reward.Reward.training_error`. The
             returns in infos are the task's.
-        reference: System on the same noise whose filter processes every measurement
-            (:func:`reference_system`), needed unless ``error`` is ``"squared"``.
+        reference: Estimator of every measurement
+            (:func:`reference_estimator`), needed unless ``error`` is ``"squared"``.
         **options: Keyword arguments of :class:`~fusion_gym.envs.sb3.FusionSB3VecEnv`.
 
     Raises:
@@ -61,7 +61,7 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         num_envs: int,
         *,
         error: str = "squared",
-        reference: System[Any] | None = None,
+        reference: Estimator[Any] | None = None,
         **options: Any,
     ) -> None:
         self.error = validation.choice("error", error, TRAINING_ERRORS)
@@ -140,15 +140,15 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         return self.task.reward.training_error(self.error, error, shift)
 
 
-def reference_system(
+def reference_estimator(
     env_id: str, options: dict[str, Any], memory_filter: str | None = None
-) -> System[Any]:
-    """Return the system of an environment whose filter processes every measurement.
+) -> Estimator[Any]:
+    """Return the estimator of an environment that processes every measurement.
 
     Args:
         env_id: Id of the environment.
         options: Options of ``gym.make``.
-        memory_filter: Filter of the system; ``None`` takes the default filter of the memory.
+        memory_filter: Its filter; ``None`` takes the default filter of the memory.
 
     Raises:
         ConfigurationError: The id, an option or the filter is unknown.
@@ -157,7 +157,7 @@ def reference_system(
     if memory_filter is not None:
         settings["memory_filter"] = memory_filter
     task = make_task(env_id, **settings)
-    return task.memory_system or task.system
+    return task.memory_estimator or task.estimator
 
 
 def make_sb3_vec_env(
@@ -197,7 +197,7 @@ def make_sb3_vec_env(
         env = FusionSB3VecEnv(task, num_envs, stagger=stagger, local=local)
     else:
         validation.choice("training_error", training_error, TRAINING_ERRORS)
-        reference = reference_system(env_id, options)
+        reference = reference_estimator(env_id, options)
         env = PrivilegedVecEnv(
             task, num_envs, error=training_error, reference=reference, stagger=stagger, local=local
         )

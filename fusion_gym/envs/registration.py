@@ -206,7 +206,7 @@ def make_task(env: str | CommonOptions, /, **options: Any) -> Task:
     Example:
         >>> import fusion_gym
         >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", horizon=50)
-        >>> task.horizon, task.sensors, task.system.state_names
+        >>> task.horizon, task.sensors, task.plant.state_names
         (50, 3, ('x1', 'x2'))
     """
     validation.limit_options(options)

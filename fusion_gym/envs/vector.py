@@ -275,7 +275,7 @@ def reset_infos(task: Task, num_envs: int) -> Infos:
     """Return the info of a reset: zeros, as in a step without requests and errors."""
     none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
     silence = np.zeros((task.sensors, num_envs), dtype=np.bool_)
-    error = np.zeros((len(task.system.state_names), num_envs))
+    error = np.zeros((len(task.plant.state_names), num_envs))
     outcome = Outcome(none, none, none, none, silence, silence, error, error, never, never)
     return step_infos(outcome)
 

@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import ObservationEntry, ObservationLayout
-from fusion_gym.core.system import Knowledge
 from fusion_gym.core.task import Task
 from fusion_gym.errors import ConfigurationError, display, refusal
 
@@ -39,7 +39,7 @@ class SchedulerView:
         self.knowledge = task.knowledge
         self.names = layout.names
         self.space = spaces.Box(layout.low, layout.high, dtype=np.float32)
-        self._sensors, self._single = task.sensors, task.access == "single"
+        self._sensors, self._single = task.sensors, task.network.access == "single"
         self.actions: spaces.MultiBinary | spaces.Discrete[Any] = spaces.MultiBinary(task.sensors)
         if self._single:
             self.actions = spaces.Discrete(task.sensors + 1)

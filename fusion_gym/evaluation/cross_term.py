@@ -18,7 +18,7 @@ import numpy as np
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import System
+from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import BATCH
 from fusion_gym.evaluation.intervals import LEVEL, Interval, mean_interval
@@ -55,7 +55,7 @@ class CrossTerm(NamedTuple):
 
 def cross_terms(
     task: Task,
-    reference: System[Any],
+    reference: Estimator[Any],
     policies: Mapping[str, Policy],
     episodes: int,
     seed: int,
@@ -67,8 +67,8 @@ def cross_terms(
 
     Args:
         task: the task.
-        reference: the system whose filter processes every measurement, on the same noise
-            (:func:`~fusion_gym.envs.privileged.reference_system`).
+        reference: the estimator that processes every measurement
+            (:func:`~fusion_gym.envs.privileged.reference_estimator`).
         policies: policies by name.
         episodes: episodes of each policy, >= 2.
         seed: seed of the first episode, >= 0.
@@ -108,7 +108,7 @@ def usual_policies(task: Task, rate: float) -> list[str]:
 
 
 def _run(
-    task: Task, system: System[Any], policy: Policy, episodes: int, seed: int,
+    task: Task, system: Estimator[Any], policy: Policy, episodes: int, seed: int,
 ) -> Array:  # fmt: skip
     """Return rate, error, floor and mismatch (4, E) of episodes, each a mean over steps."""
     batch = EpisodeBatch(task, episodes, owner_of(policy), system)

@@ -167,9 +167,10 @@ def _normalised_error(error: Array, covariance: Array) -> Array:
 
 def _counted(task: Task, state: Any, error: Array, covariance: Array) -> tuple[Array, Array]:
     """Return error and covariance whose normalised error has only the known truths."""
-    if not task.system.offers("available"):
+    available = task.plant.available(state.plant)
+    if available is None:
         return error, covariance
-    known = task.system.available(state)[1]
+    known = available[1]
     covariance = np.where(known[:, None] & known, covariance, np.eye(len(known))[..., None])
     return error * np.sqrt(len(known) / np.maximum(known.sum(0), 1)), covariance
 
@@ -191,7 +192,7 @@ def _run_batch(
     returns, squared_error = np.zeros(runs), []
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
-        covariance = task.system.fused(batch.delivered)[1]
+        covariance = task.estimator.covariance(batch.delivered.estimate)
         squared_error.append(outcome.squared_error.reshape(-1, len(policies), episodes).mean(-1))
         means["mse"] += outcome.squared_error.sum(0)
         means["bound_trace"] += linalg.trace(covariance)
@@ -277,11 +278,12 @@ def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
         state = batch.delivered
-        mean, covariance = task.system.fused(state)
-        rows["truth"].append(task.system.truth(state)[:, 0])
+        mean = task.estimator.mean(state.estimate)
+        covariance = task.estimator.covariance(state.estimate)
+        rows["truth"].append(task.plant.truth(state.plant)[:, 0])
         rows["mean"].append(mean[:, 0])
         rows["variance"].append(linalg.diagonal(covariance)[:, 0])
-        rows["local_mean"].append(task.system.local_means(state)[..., 0])
+        rows["local_mean"].append(task.estimator.local_means(state.estimate)[..., 0])
         rows["tokens"].append(batch.tokens[0])
         rows["requested"].append(outcome.requested[:, 0])
         rows["granted"].append(outcome.granted[:, 0])

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.base import Requests

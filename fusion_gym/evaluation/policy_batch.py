@@ -12,7 +12,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.beliefs import Beliefs, Estimate, Owner
-from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signals
+from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, decide, guard, owner_of
 from fusion_gym.validation import ConfigurationError

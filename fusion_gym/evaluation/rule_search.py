@@ -158,7 +158,7 @@ class RuleSearch:
         task = self.task
         per_sensor = ["threshold", "price_exponent"] if len(self.prices) > 1 else ["threshold"]
         names = [name for name in per_sensor for _ in range(task.sensors)]
-        names += ["mixture"] if task.bucket.unlimited else ["mixture", "token_exponent"]
+        names += ["mixture"] if task.network.bucket.unlimited else ["mixture", "token_exponent"]
         names.append("age_exponent")
         if task.sensors > 1 and not self.own:
             names += ["margin", "margin_exponent"] if len(self.prices) > 1 else ["margin"]
@@ -167,7 +167,7 @@ class RuleSearch:
     @functools.cached_property
     def start(self) -> tuple[ThresholdTrial, ...]:
         """The best single threshold at each price, with or without a wide margin."""
-        worth = np.array(self.prices) * self.task.bucket.cost / self.task.error_scale
+        worth = np.array(self.prices) * self.task.network.bucket.cost / self.task.error_scale
         low, high = self.bounds or (worth.min() / 30.0, worth.max() * 3.0)
         values = np.geomspace(low, high, 24).tolist()
         margins = (1.0, _WIDE) if "margin" in self.coordinates else (1.0,)

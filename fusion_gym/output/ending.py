@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from fusion_gym.core.system import SignalError
+from fusion_gym.core.knowledge import SignalError
 from fusion_gym.validation import ConfigurationError
 
 # Folders of Python and of packages, whose frames are not a user's.

@@ -1,7 +1,7 @@
 """Every policy: trigger rules, reference policies and saved agents.
 
-A policy declares the least knowledge class of :mod:`fusion_gym.core.system` that has every signal
-it uses. A test changes all other signals and requires bitwise equal requests.
+A policy declares the least class of :mod:`fusion_gym.core.knowledge` that has every signal it uses.
+A test changes all other signals and requires bitwise equal requests.
 
 The classes with memory use unsent measurements. Three triggers of papers belong to them although
 they store one number or one measurement per sensor: ``dynamic_event`` and ``adaptive_threshold``

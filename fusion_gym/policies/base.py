@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signal, Signals, covers, least_covering
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.signals import MEMORY_SIGNALS, PLANNING_SIGNALS
-from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signal, Signals, covers, least_covering
+from fusion_gym.core.signals import MEMORY_SIGNALS, NETWORK_SIGNALS, PLANNING_SIGNALS
 from fusion_gym.core.task import Task
 from fusion_gym.namespace import namespace
 
@@ -43,7 +43,7 @@ class Policy(Protocol):
 
     @property
     def knowledge(self) -> Knowledge:
-        """The least class of :mod:`fusion_gym.core.system` that has every signal of the policy."""
+        """The least class (:mod:`fusion_gym.core.knowledge`) that has every signal it uses."""
         ...
 
     def reset(self, runs: int, seed: int = 0) -> None:
@@ -68,10 +68,11 @@ def owner_of(policy: Policy) -> Owner | None:
 def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     """Return the signals outside a policy's declared knowledge, with the reason of each refusal."""
     knower = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # no declaration: all signals
-    least = {signal.name: signal for signal in task.system.signals}
+    least = {signal.name: signal for signal in task.estimator.signals}
     if not task.memory and covers(knower, "own"):
         knower = least_covering((knower, "own_memory"))  # beliefs use only the new measurements
-    least |= {signal.name: signal for signal in (*MEMORY_SIGNALS, *PLANNING_SIGNALS)}
+    every = (*MEMORY_SIGNALS, *NETWORK_SIGNALS, *PLANNING_SIGNALS)
+    least |= {signal.name: signal for signal in every}
     node: Knowledge = "own" if covers(task.knowledge, "own") else task.knowledge
     least["observation"] = Signal("observation", node, "(N, entries)", "rows of every class")
     return {

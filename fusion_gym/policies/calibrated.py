@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Signals, least_covering
+from fusion_gym.core.knowledge import Signals, least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.policies.archive import read_part
 from fusion_gym.policies.base import Requests
@@ -147,7 +147,9 @@ class CalibratedPolicy:
             own = np.take_along_axis(logits, agent[None, None], 0)[0]
             score += (1.0 - mixture) * np.where(mixture < 1.0, own, 0.0)
         requests: Requests = score >= threshold
-        if self.task.access == "single":  # an agent names one sensor, the rule leaves the choice
+        if (
+            self.task.network.access == "single"
+        ):  # an agent names one sensor, the rule leaves the choice
             best = score.argmax(0) == np.arange(len(score))[:, None]
             requests &= best | (mixture == 1.0)
         return requests

@@ -205,7 +205,7 @@ def _fitted(
             f"{view.space.shape}"
         )
     allowed = {str(view.actions): (task.action, view)}
-    if not observed.local and task.access != "single":
+    if not observed.local and task.network.access != "single":
         for kind in set(ACTION_KINDS) - {task.action}:
             other = make_view(dataclasses.replace(task, action=kind))
             allowed[str(other.actions)] = (kind, other)

@@ -7,8 +7,8 @@ import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.belief_rule import check_owner, knows
@@ -73,7 +73,7 @@ class Lookahead:
         self.price = validation.number("price", price, at_least=0.0)
         check_owner(task, own=False)
         self._task, self.knowledge = task, knows(task, own=False)
-        self.greedy = task.sensors > _MOST_TOGETHER and task.access != "single"
+        self.greedy = task.sensors > _MOST_TOGETHER and task.network.access != "single"
         if self.greedy and task.sensors > _MOST_GREEDY:
             raise ConfigurationError(
                 f"sensors = {task.sensors} is not allowed with policy 'lookahead': it must be at "

@@ -11,9 +11,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge, Signals, least_covering
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.reward import Price
-from fusion_gym.core.system import Knowledge, Signals, least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.policies.base import Requests
@@ -126,7 +126,7 @@ class ModelPolicy:
             allowed = "an agent with one logit for each sensor (ppo, a2c, trpo, maskable_ppo)"
             raise refusal("policy", type(model).__name__, allowed)
         together = isinstance(actions, spaces.Discrete) and self.view.rows_per_run == 1
-        if together and self.task.access != "single":
+        if together and self.task.network.access != "single":
             raise refusal("action", str(actions), "MultiBinary, or access='single'")
 
     def logits(self, signals: Signals) -> Array:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from fusion_gym.core.knowledge import MEANING, Block, numbered
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import plain_options
-from fusion_gym.core.system import MEANING, Block, numbered
 from fusion_gym.envs.views import SensorView
 from fusion_gym.policies.card import algorithm_name
 from fusion_gym.policies.model import ModelPolicy
@@ -104,7 +104,7 @@ def _action(agent: ModelPolicy, graph: DecisionGraph) -> dict[str, Any]:
     """Return the action space and the requests of each of its numbers."""
     choices = None if graph.choices is None else graph.choices.tolist()
     space = {"space": str(agent.view.actions), "sensors": agent.task.sensors}
-    return space | {"access": agent.task.access, "choices": choices}
+    return space | {"access": agent.task.network.access, "choices": choices}
 
 
 def _fixed_price(agent: ModelPolicy) -> float | None:

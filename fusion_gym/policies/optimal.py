@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.reward import Price
-from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
 from fusion_gym.solvers.task import solve_task

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Knowledge, Signals, System
+from fusion_gym.core.estimator import Estimator, Reception
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
+from fusion_gym.systems.correlated.system import CorrelatedTrackingEstimator
 from fusion_gym.validation import ConfigurationError
 
 _MOST = 200_000  # schedules of one search
@@ -101,11 +103,11 @@ class PeriodicOptimum:
         validation.integer("period", period, at_least=1, at_most=validation.MOST_STEPS)
         validation.integer("packets", packets, at_least=1, at_most=period * task.sensors)
         validation.choice("average", average, AVERAGES)
-        if task.access != "any":
+        if task.network.access != "any":
             where = "with policy 'periodic_optimum'"
             allowed = "'any', because the search grants every request"
-            raise validation.refusal("access", task.access, allowed, where)
-        _cycle(task.system)
+            raise validation.refusal("access", task.network.access, allowed, where)
+        _cycle(task.estimator)
         count = math.comb(period * task.sensors, packets)
         if count > _MOST:
             raise ConfigurationError(
@@ -114,7 +116,7 @@ class PeriodicOptimum:
                 "use a smaller period"
             )
         steps = task.horizon if average == "episode" else None
-        self.schedule, self.trace = optimum(task.system, packets, period, steps)
+        self.schedule, self.trace = optimum(task, packets, period, steps)
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Do nothing; the policy has no memory."""
@@ -125,43 +127,44 @@ class PeriodicOptimum:
         return np.ascontiguousarray(self.schedule[place].T)
 
 
-def optimum(system: System[Any], packets: int, period: int, steps: int | None = None) -> Schedule:
+def optimum(task: Task, packets: int, period: int, steps: int | None = None) -> Schedule:
     """Return the schedule with the smallest trace, from the cache if it is known.
 
     Of equal traces (to a relative 1e-9) the first schedule in the order of steps and sensors wins.
 
     Args:
-        system: declares a ``covariance_cycle``.
+        task: its estimator declares a ``covariance_cycle``.
         packets: requests of all sensors in a period.
         period: number of steps of the schedule.
         steps: number of steps of the mean from the start; None for the steady state.
 
     Raises:
-        ConfigurationError: the system's covariances depend on the data.
+        ConfigurationError: the covariances depend on the data.
     """
-    key = hashlib.sha256(pickle.dumps((system, packets, period, steps))).hexdigest()
+    parts = task.plant, task.estimator, packets, period, steps
+    key = hashlib.sha256(pickle.dumps(parts)).hexdigest()
     if key not in _cache:
-        _cache[key] = _search(system, packets, period, steps)
+        _cache[key] = _search(task, packets, period, steps)
     return _cache[key]
 
 
-def steady_traces(system: System[Any], schedules: Patterns) -> Array:
+def steady_traces(task: Task, schedules: Patterns) -> Array:
     """Return the steady-state traces (N,) of the fused error's covariance under periodic schedules.
 
-    The system runs without noise, one run per schedule, since its covariances do not depend on the
+    The plant runs without noise, one run per schedule, since the covariances do not depend on the
     data. A cycle is the common period of schedules and sampling. The mean is over the first cycle
     that differs in all runs by less than a relative 1e-9 from the cycle before. After 1,000 steps
     it is over the last cycle, which is no steady state where the plant or a node never settles.
 
     Args:
-        system: declares a ``covariance_cycle``.
+        task: its estimator declares a ``covariance_cycle``.
         schedules: (period, sensors, N) bool, row 0 for the first step of an episode.
 
     Raises:
-        ConfigurationError: the system's covariances depend on the data.
+        ConfigurationError: the covariances depend on the data.
     """
-    length = math.lcm(len(schedules), _cycle(system))
-    run = _Still(system, schedules)
+    length = math.lcm(len(schedules), _cycle(task.estimator))
+    run = _Still(task, schedules)
     before = np.full(schedules.shape[-1], np.inf)
     for _ in range(0, _LONGEST, length):
         total = run.total(length)
@@ -172,39 +175,45 @@ def steady_traces(system: System[Any], schedules: Patterns) -> Array:
     return np.asarray(before / length)
 
 
-def episode_traces(system: System[Any], schedules: Patterns, steps: int) -> Array:
+def episode_traces(task: Task, schedules: Patterns, steps: int) -> Array:
     """Return traces (N,) as in :func:`steady_traces`, averaged over the first ``steps`` steps."""
-    _cycle(system)
-    return _Still(system, schedules).total(steps) / steps
+    _cycle(task.estimator)
+    return _Still(task, schedules).total(steps) / steps
 
 
 class _Still:
     """Runs without noise from the start, one per schedule (period, sensors, N)."""
 
-    def __init__(self, system: System[Any], schedules: Patterns) -> None:
-        self._covariance: Callable[[Any], Array] = lambda state: system.fused(state)[1]
-        self._system, self._schedules, self._step = system, schedules, 0
-        if system.offers("error_covariance"):
-            self._system = system.with_actual_covariance()
-            self._covariance = self._system.error_covariance
+    def __init__(self, task: Task, schedules: Patterns) -> None:
+        estimator: Any = task.estimator
+        self._covariance: Callable[[Any], Array] = estimator.covariance
+        if isinstance(estimator, CorrelatedTrackingEstimator):
+            estimator = estimator.with_actual_covariance()
+            self._covariance = estimator.error_covariance
+        self._plant, self._estimator = task.plant, estimator
+        self._schedules, self._step = schedules, 0
         runs = schedules.shape[-1]
-        self._still = np.zeros((system.noise_channels, runs))
-        self._state = self._system.start(np.zeros((system.start_channels, runs)))
+        self._still = np.zeros((task.plant.noise_channels, runs))
+        start = np.zeros((task.plant.start_channels, runs))
+        self._truth, announcement = task.plant.start(start)
+        self._state = estimator.start(task.plant.measurement(self._truth), announcement)
 
     def total(self, steps: int) -> Array:
         """Return the sum (N,) of the traces over the next ``steps`` steps."""
         total = np.zeros(self._schedules.shape[-1])
         for step in range(self._step, self._step + steps):
-            delivered = self._schedules[step % len(self._schedules)]
-            sensed = self._system.sense(self._state, self._still)
-            self._state = self._system.deliver(sensed, delivered)
+            reception = Reception(self._schedules[step % len(self._schedules)])
+            self._truth = self._plant.sense(self._truth, self._still)
+            measurement = self._plant.measurement(self._truth)
+            state = self._estimator.observe(self._estimator.predict(self._state), measurement)
+            self._state = self._estimator.update(state, reception)
             total += linalg.trace(self._covariance(self._state))
         self._step += steps
         return total
 
 
-def _search(system: System[Any], packets: int, period: int, steps: int | None) -> Schedule:
-    sensors = system.sensor_count
+def _search(task: Task, packets: int, period: int, steps: int | None) -> Schedule:
+    sensors = task.sensors
     places = period * sensors
     every = itertools.combinations(range(places), packets)
     best, trace = np.zeros((period, sensors), dtype=np.bool_), math.inf
@@ -214,21 +223,21 @@ def _search(system: System[Any], packets: int, period: int, steps: int | None) -
             schedules[list(selection), number] = True
         shaped = schedules.reshape(period, sensors, -1)
         if steps is None:
-            traces = steady_traces(system, shaped)
+            traces = steady_traces(task, shaped)
         else:
-            traces = episode_traces(system, shaped, steps)
+            traces = episode_traces(task, shaped, steps)
         first = int(np.flatnonzero(traces <= traces.min() * (1.0 + 1e-9))[0])
         if traces[first] < trace * (1.0 - 1e-9):
             best, trace = schedules[:, first].reshape(period, sensors), float(traces[first])
     return Schedule(best, trace)
 
 
-def _cycle(system: System[Any]) -> int:
-    if not system.offers("covariance_cycle"):
+def _cycle(estimator: Estimator[Any]) -> int:
+    if estimator.covariance_cycle is None:
         raise ConfigurationError(
-            f"policy 'periodic_optimum' is not allowed with {type(system).__name__}: it must be a "
-            "system whose covariances depend only on deliveries, such as MarkovJumpTracking-v1 "
-            "with filter='local' or 'centralised', CorrelatedTracking-v1, or UnknownInput-v1 "
-            "with filter='random_walk' or 'predict'"
+            f"policy 'periodic_optimum' is not allowed with {type(estimator).__name__}: its "
+            "covariances must depend only on deliveries, as in MarkovJumpTracking-v1 with "
+            "filter='local' or 'centralised', CorrelatedTracking-v1, or UnknownInput-v1 with "
+            "filter='random_walk' or 'predict'"
         )
-    return system.covariance_cycle
+    return estimator.covariance_cycle

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import silent_path
-from fusion_gym.core.system import Signals
+from fusion_gym.core.estimator import Reception
+from fusion_gym.core.knowledge import Signals
+from fusion_gym.core.network import NetworkState
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
 from fusion_gym.policies.belief_rule import beliefs_of
@@ -15,7 +17,7 @@ from fusion_gym.policies.belief_rule import beliefs_of
 
 def transmission_sets(task: Task) -> NDArray[np.bool_]:
     """Return every set of sensors that may transmit together (sets, sensors), silence first."""
-    if task.access == "single":
+    if task.network.access == "single":
         silence = np.zeros((1, task.sensors), dtype=np.bool_)
         return np.concatenate((silence, np.eye(task.sensors, dtype=np.bool_)[::-1]))
     return np.array(list(product((False, True), repeat=task.sensors)))
@@ -32,23 +34,25 @@ class PlanningModel:
     """
 
     def __init__(self, task: Task, signals: Signals) -> None:
-        self._task, self._state = task, signals["model"]
-        self._tokens, self._admitted = signals["tokens"], signals["admitted"]
-        self._queue = signals["queue"]
+        self._task, self._estimate = task, signals["estimate"]
+        queue, admitted = signals["queue"], signals["admitted"]
+        self._network = NetworkState(signals["tokens"], queue, admitted)
+        if task.network.channel is not None and task.network.channel.states > 1:
+            self._network.channel = signals["channel_state"]
         self._beliefs = beliefs_of(signals, own=False) if task.memory else None
-        system = task.system
-        self.arrival: Array | None = None
-        if system.offers("arrival_probability"):
-            self.arrival = system.arrival_probability(self._state)
+        self.arrival = task.network.arrival_probability(self._network)
 
     @property
     def runs(self) -> int:
         """Number N of runs."""
-        return len(self._tokens)
+        return len(self._network.tokens)
 
     def grant(self, requests: NDArray[np.bool_]) -> Grants:
         """Return the network's answer to requests (sensors, N) now."""
-        return self._task.bucket.grant(self._tokens, requests & self._admitted, self._queue)
+        network = self._network
+        return self._task.network.bucket.grant(
+            network.tokens, requests & network.admitted, network.queue
+        )
 
     def fused_means(self, arriving: NDArray[np.bool_], steps: int) -> Array:
         """Return the predicted fused means (steps, n, N) after a delivery of these packets.
@@ -60,18 +64,16 @@ class PlanningModel:
             arriving: delivered packets (sensors, N).
             steps: number of steps.
         """
-        system = self._task.system
-        delivered = system.deliver(self._state, arriving)
+        estimator = self._task.estimator
+        updated = estimator.update(self._estimate, Reception(arriving))
         if self._task.packet == "estimate" and self._beliefs is not None:
             mean, covariance = self._beliefs.best
-            delivered = system.adopt(delivered, mean[0], covariance[0], np.asarray(arriving.any(0)))
-        return silent_path(system, delivered, steps)
+            updated = estimator.adopt(updated, mean[0], covariance[0], np.asarray(arriving.any(0)))
+        return silent_path(estimator, updated, steps)
 
     def best_means(self, steps: int) -> Array:
         """Return the predicted means (steps, n, N) of the best estimate, from all measurements."""
-        memory_system = self._task.memory_system
-        if memory_system is None or self._beliefs is None:
+        estimator = self._task.memory_estimator
+        if estimator is None or self._beliefs is None:
             return self.fused_means(np.ones((self._task.sensors, self.runs), np.bool_), steps)
-        return silent_path(
-            memory_system, memory_system.visible(self._beliefs.memory_posterior), steps
-        )
+        return silent_path(estimator, self._beliefs.memory_posterior, steps)

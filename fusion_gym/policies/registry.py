@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, TypedDict, get_args
 import numpy as np
 
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import KNOWLEDGE, SignalError
+from fusion_gym.core.knowledge import KNOWLEDGE, SignalError
 from fusion_gym.core.task import Task
 from fusion_gym.importing import TRUST, import_named
 from fusion_gym.policies.base import Policy, guard, owner_of

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, guard, is_stateless, owner_of
 from fusion_gym.policies.belief_rule import check_owner, knows
@@ -26,7 +26,7 @@ class Rollout:
 
     At every step the first decisions are silence, each single sensor, and the base's requests.
     After each of them the base continues for ``steps`` steps, in ``samples`` simulations. The
-    simulations start from the beliefs (:meth:`~fusion_gym.core.system.System.imagine`) and draw
+    simulations start from the beliefs (:meth:`~fusion_gym.core.plant.Plant.draw`) and draw
     their own noise, the same for every decision; they use neither the truth nor the coming noise
     and losses. The rule takes the decision of the least mean cost among the decisions that beat the
     base's decision by ``doubt`` standard errors of the difference. With ``doubt=0`` it takes the
@@ -170,7 +170,7 @@ class Rollout:
         for step in range(self.steps + 1):
             best = branch.beliefs().best.mean[0]
             spent = branch.deliver(requests).cost
-            missed = best - self._task.system.fused(branch.delivered)[0]
+            missed = best - self._task.estimator.mean(branch.delivered.estimate)
             cost += linalg.total(self._weights * missed * missed) + price * spent
             if step < self.steps:
                 branch.sense(noise[step].take(lanes, axis=-1))

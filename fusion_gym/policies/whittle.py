@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests, check_at_most, strongest
 from fusion_gym.solvers.task import source_problems
@@ -58,10 +58,10 @@ class WhittleIndex:
     def __init__(self, task: Task, price: float | None = None, at_most: int | None = None) -> None:
         check_at_most("at_most", at_most)
         problems = source_problems(task)
-        self._at_most = 1 if at_most is None and task.access == "single" else at_most
+        self._at_most = 1 if at_most is None and task.network.access == "single" else at_most
         fixed = task.reward.price.fixed if price is None else price
         self._price = validation.number("price", fixed, at_least=0.0)
-        self._cost = task.bucket.cost
+        self._cost = task.network.bucket.cost
         self._tables = [index_table(number, problem) for number, problem in enumerate(problems)]
 
     @property

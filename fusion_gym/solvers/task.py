@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.channel import Channel
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import AverageSolution, FiniteSolution, solve_average, solve_finite
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
-from fusion_gym.systems.remote.system import RemoteEstimationSystem
+from fusion_gym.systems.remote.system import ScalarSources
 from fusion_gym.validation import ConfigurationError
 
 CRITERIA = ("finite", "average")
@@ -55,7 +56,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     Raises:
         ConfigurationError: another system, a drawn price, or a reward without the squared error.
     """
-    system, reward = _system(task), task.reward
+    system, channel, reward = _sources(task), _channel(task), task.reward
     if reward.error != "squared":
         raise validation.refusal("error", reward.error_kind, "'squared'", "for the optimum")
     if reward.price.fixed is None:
@@ -65,22 +66,27 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
         SourceProblem.create(
             coefficient=float(system.coefficient[i]),
             deviation=float(system.deviation[i]),
-            price=reward.price.fixed * float(task.bucket.cost[i, 0]),
+            price=reward.price.fixed * float(task.network.bucket.cost[i, 0]),
             error_weight=float(weights[i]),
-            drop=system.channel.drop[:, i],
-            transition=system.channel.transition,
-            initial=system.channel.initial,
+            drop=channel.drop[:, i],
+            transition=channel.transition,
+            initial=channel.initial,
         )
         for i in range(system.sensor_count)
     )
 
 
-def _system(task: Task) -> RemoteEstimationSystem:
-    if not isinstance(task.system, RemoteEstimationSystem):
+def _channel(task: Task) -> Channel:
+    """Return the losses of the task's network."""
+    return task.network.channel or Channel.perfect(task.sensors)
+
+
+def _sources(task: Task) -> ScalarSources:
+    if not isinstance(task.plant, ScalarSources):
         raise ConfigurationError(
-            f"system = {type(task.system).__name__} is not allowed: it must be remote estimation"
+            f"plant = {type(task.plant).__name__} is not allowed: it must be remote estimation"
         )
-    return task.system
+    return task.plant
 
 
 def solve_task(task: Task, criterion: str = "finite") -> Optimum:
@@ -96,9 +102,9 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
             (:func:`fusion_gym.solvers.bounds.lagrangian_bound` bounds its cost from below).
     """
     validation.choice("criterion", criterion, CRITERIA)
-    problems, bucket = source_problems(task), task.bucket
+    problems, bucket = source_problems(task), task.network.bucket
     single = len(problems) == 1
-    if not single and not (task.access == "any" and bucket.unlimited):
+    if not single and not (task.network.access == "any" and bucket.unlimited):
         return _solve_pair(task, problems, criterion)
     # Several independent sources have unlimited tokens, of one level.
     tokens = TokenLevels.create(bucket) if single else problems[0].tokens
@@ -109,7 +115,7 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
         if criterion == "average":
             solution = solve_average(problem)
         else:
-            system = _system(task)
+            system = _sources(task)
             spread = float(system.initial_deviation[i])
             solution = solve_finite(problem, task.horizon, spread)
         if not solution.ordered:
@@ -133,16 +139,18 @@ def _solve_pair(task: Task, problems: tuple[SourceProblem, ...], criterion: str)
     if len(problems) != 2:
         where = "for the optimum under limited tokens or access"
         raise validation.refusal("sensors", len(problems), "1 or 2", where)
-    if task.access not in ("any", "single"):
+    if task.network.access not in ("any", "single"):
         allowed = "'any' or 'single'"
-        raise validation.refusal("access", task.access, allowed, "for the optimum of two sources")
-    at_most = 1 if task.access == "single" else 2
-    problem = JointProblem.create(problems, task.bucket, at_most)
+        raise validation.refusal(
+            "access", task.network.access, allowed, "for the optimum of two sources"
+        )
+    at_most = 1 if task.network.access == "single" else 2
+    problem = JointProblem.create(problems, task.network.bucket, at_most)
     if criterion == "average":
         stationary = solve_joint_average(problem)
         cost, choice, grids = stationary.cost, stationary.choice[None], stationary.grids
     else:
-        first, two = _system(task).initial_deviation.tolist()
+        first, two = _sources(task).initial_deviation.tolist()
         episode = solve_joint_finite(problem, task.horizon, (first, two))
         cost, choice, grids = episode.cost, episode.choice, episode.grids
     return Optimum(cost, math.nan, math.nan, problem.tokens, choice=choice, grids=grids)

@@ -47,7 +47,7 @@ class Sensors:
 
 
 @dataclass(frozen=True)
-class Plant:
+class LinearDynamics:
     """The common part of linear plants: A, the noise w ~ N(0, W) and the law of x(0).
 
     Shapes: ``transition`` A (n, n, 1), ``process_covariance`` W (n, n, 1), ``process_factor``
@@ -103,7 +103,7 @@ class Plant:
 
 
 @dataclass(frozen=True)
-class LinearPlant(Plant):
+class LinearPlant(LinearDynamics):
     """x(t+1) = A x(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
 
     Source: tobit_token_bucket, equation (1).

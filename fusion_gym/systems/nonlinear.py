@@ -1,8 +1,9 @@
 """Base class of a nonlinear system of your own: you write plant, sensors and filter."""
 
+from __future__ import annotations
+
 import functools
-from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,15 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import (
+from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.knowledge import (
     Block,
-    SignalArray,
-    System,
     age_block,
     common_signals,
     log_deviation,
     numbered,
 )
+from fusion_gym.core.plant import Plant
 
 _RUNS = 1000  # that tell what happens without transmissions
 _SEED = 20_240_229  # of their noise
@@ -26,15 +27,22 @@ _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clippe
 
 
 @dataclass(slots=True)
-class FilteredState:
-    """The state of N runs at one time; n states, l sensors of m channels.
+class NonlinearTruth:
+    """The true state ``truth`` (n, N), and the ``measurement`` (l, m, N)."""
 
-    ``truth`` (n, N) · ``measurement`` and ``held``, the last delivered one, (l, m, N) · ``age``
-    (l, N) · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the
+    truth: Array
+    measurement: Array
+
+
+@dataclass(slots=True)
+class FilteredEstimate:
+    """The estimate of N runs at one time; n states, l sensors of m channels.
+
+    ``measurement`` and ``held``, the last delivered one, (l, m, N) · ``age`` (l, N) ·
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the
     posterior.
     """
 
-    truth: Array
     measurement: Array
     held: Array
     age: Array
@@ -44,7 +52,7 @@ class FilteredState:
     covariance: Array
 
 
-class NonlinearSystem(System[FilteredState]):
+class NonlinearSystem(ABC):
     """A plant with sensors and a filter at the centre, of which you write four methods.
 
     :meth:`move` and :meth:`measure` are the truth, :meth:`predict` and :meth:`update` the filter.
@@ -82,9 +90,6 @@ class NonlinearSystem(System[FilteredState]):
         ('x',)
     """
 
-    signals = common_signals()
-    extensions = ("move", "measure", "predict", "update")
-
     def __init__(
         self,
         state_names: tuple[str, ...],
@@ -97,7 +102,7 @@ class NonlinearSystem(System[FilteredState]):
     ) -> None:
         self.state_names = tuple(state_names)
         size = len(self.state_names)
-        self._sensors = validation.integer("sensors", sensors, at_least=1)
+        self.sensors = validation.integer("sensors", sensors, at_least=1)
         self.channels = validation.integer("channels", channels, at_least=1)
         self.process_channels = validation.integer("process_channels", process_channels, at_least=0)
         self.initial_mean = validation.array("initial_mean", initial_mean, (size,))
@@ -145,25 +150,110 @@ class NonlinearSystem(System[FilteredState]):
             measurement: its measurement (m, N).
         """
 
+    @functools.cached_property
+    def plant(self) -> NonlinearPlant:
+        """The truth, for a scenario."""
+        return NonlinearPlant(self)
+
+    @functools.cached_property
+    def estimator(self) -> NonlinearEstimator:
+        """The filter at the centre, for a scenario."""
+        return NonlinearEstimator(self)
+
+    def measured(self, state: Array, noise: Array) -> Array:
+        """Return checked measurements (l, m, N) from normals (l * m, N)."""
+        shape = (self.sensors, self.channels, state.shape[-1])
+        values = np.asarray(self.measure(state, noise.reshape(shape)), dtype=np.float64)
+        if values.shape != shape:
+            raise ValueError(
+                f"measure of shape {values.shape} is not allowed: it must be {shape}, sensors, "
+                "channels and runs"
+            )
+        return values
+
+    @functools.cached_property
+    def typical(self) -> tuple[Array, Array]:
+        """Root mean square and open-loop error variance (n,) of each state, over ten steps."""
+        moment, error = self.silence(10)
+        return np.sqrt(np.maximum(moment, 1e-12)), np.maximum(error, 1e-12)
+
+    def silence(self, horizon: int) -> tuple[Array, Array]:
+        """Mean second moment and squared error (n,) over t = 1..horizon without transmissions."""
+        generator, plant, filters = np.random.default_rng(_SEED), self.plant, self.estimator
+        truth, _ = plant.start(generator.standard_normal((plant.start_channels, _RUNS)))
+        state = filters.start(truth.measurement, None)
+        nobody = Reception(np.zeros((self.sensors, _RUNS), dtype=np.bool_))
+        moment = error = np.zeros(len(self.state_names))
+        for _ in range(horizon):
+            truth = plant.sense(truth, generator.standard_normal((plant.noise_channels, _RUNS)))
+            state = filters.update(filters.predict(state), nobody)
+            moment = moment + (truth.truth**2).mean(-1)
+            error = error + ((truth.truth - state.mean) ** 2).mean(-1)
+        return moment / horizon, error / horizon
+
+
+class NonlinearPlant(Plant[NonlinearTruth]):
+    """The truth of a :class:`NonlinearSystem`."""
+
+    def __init__(self, system: NonlinearSystem) -> None:
+        self.system, self.state_names = system, system.state_names
+
     @property
     def sensor_count(self) -> int:
         """Number of sensors."""
-        return self._sensors
+        return self.system.sensors
 
     @property
     def noise_channels(self) -> int:
         """Normals of one step: plant, then sensors."""
-        return self.process_channels + self.sensor_count * self.channels
+        return self.system.process_channels + self.system.sensors * self.system.channels
 
     @property
     def start_channels(self) -> int:
         """Normals of a start: state, then first measurement."""
-        return len(self.state_names) + self.sensor_count * self.channels
+        return len(self.state_names) + self.system.sensors * self.system.channels
+
+    def start(self, noise: Array) -> tuple[NonlinearTruth, None]:
+        """Draw the initial state, and measure."""
+        size, system = len(self.state_names), self.system
+        mean = np.repeat(system.initial_mean[:, None], noise.shape[-1], axis=1)
+        truth = mean + linalg.root(system.initial_covariance[..., None])[..., 0] @ noise[:size]
+        return NonlinearTruth(truth, system.measured(truth, noise[size:])), None
+
+    def sense(self, state: NonlinearTruth, noise: Array) -> NonlinearTruth:
+        """Move the plant, and measure."""
+        own = self.system.process_channels
+        truth = self.system.move(state.truth, noise[:own])
+        return NonlinearTruth(truth, self.system.measured(truth, noise[own:]))
+
+    @property
+    def draw_channels(self) -> int:
+        """Number of states."""
+        return len(self.state_names)
+
+    def draw(
+        self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
+    ) -> NonlinearTruth:
+        """Draw the truth from N(mean, covariance)."""
+        return NonlinearTruth(linalg.draw_normal(mean, covariance, noise), measurement)
+
+    def open_loop(self, horizon: int) -> Array:
+        """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""
+        return self.system.silence(horizon)[1]
+
+
+class NonlinearEstimator(Estimator[FilteredEstimate]):
+    """The filter of a :class:`NonlinearSystem`, at the centre."""
+
+    signals = common_signals()
+
+    def __init__(self, system: NonlinearSystem) -> None:
+        self.system = system
 
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes, entries = numbered(self.sensor_count), numbered(self.channels)
+        nodes, entries = numbered(self.system.sensors), numbered(self.system.channels)
         return (
             Block(
                 "whitened_innovation",
@@ -187,65 +277,61 @@ class NonlinearSystem(System[FilteredState]):
             Block(
                 "log_variance",
                 "logarithm of the predicted variance over its open-loop mean",
-                lambda s: 2.0 * log_deviation(s.prior_covariance, self._typical[1]),
-                (self.state_names,),
+                lambda s: 2.0 * log_deviation(s.prior_covariance, self.system.typical[1]),
+                (self.system.state_names,),
                 node="broadcast",
                 limit=_RANGE,
-                constants={"open-loop mean": self._typical[1]},
+                constants={"open-loop mean": self.system.typical[1]},
             ),
             Block(
                 "estimate",
                 "prediction over the state's root mean square",
-                lambda s: s.prior_mean / self._typical[0][:, None],
-                (self.state_names,),
+                lambda s: s.prior_mean / self.system.typical[0][:, None],
+                (self.system.state_names,),
                 node="broadcast",
                 limit=_RANGE,
-                constants={"root mean square": self._typical[0]},
+                constants={"root mean square": self.system.typical[0]},
             ),
         )
 
-    def start(self, noise: Array) -> FilteredState:
-        """Draw the initial state; every first measurement is known without charge."""
-        size, runs = len(self.state_names), noise.shape[-1]
-        mean = np.repeat(self.initial_mean[:, None], runs, axis=1)
-        truth = mean + linalg.root(self.initial_covariance[..., None])[..., 0] @ noise[:size]
-        measurement = self._measured(truth, noise[size:])
-        covariance = np.repeat(self.initial_covariance[..., None], runs, axis=-1)
-        age = np.zeros((self.sensor_count, runs))
-        return FilteredState(
-            truth, measurement, measurement, age, mean, covariance, mean, covariance
-        )
+    def start(self, measurement: Array, announcement: None) -> FilteredEstimate:
+        """Return the law of the initial state; every first measurement is known without charge."""
+        runs, system = measurement.shape[-1], self.system
+        mean = np.repeat(system.initial_mean[:, None], runs, axis=1)
+        covariance = np.repeat(system.initial_covariance[..., None], runs, axis=-1)
+        age = np.zeros((system.sensors, runs))
+        return FilteredEstimate(measurement, measurement, age, mean, covariance, mean, covariance)
 
-    def sense(self, state: FilteredState, noise: Array) -> FilteredState:
-        """Move the plant, measure, and predict."""
-        own = self.process_channels
-        truth = self.move(state.truth, noise[:own])
-        prior_mean, prior_covariance = self.predict(state.mean, state.covariance)
+    def predict(self, state: FilteredEstimate) -> FilteredEstimate:
+        """Predict."""
+        mean, covariance = self.system.predict(state.mean, state.covariance)
         return replace(
             state,
-            truth=truth,
-            measurement=self._measured(truth, noise[own:]),
             age=state.age + 1.0,
-            prior_mean=prior_mean,
-            prior_covariance=linalg.symmetrise(prior_covariance),
+            prior_mean=mean,
+            prior_covariance=linalg.symmetrise(covariance),
         )
 
-    def deliver(self, state: FilteredState, granted: NDArray[np.bool_]) -> FilteredState:
-        """Update the centre with the granted (l, N) measurements, sensor by sensor."""
-        mean, covariance = state.prior_mean, state.prior_covariance
-        for sensor in np.flatnonzero(granted.any(1)).tolist():
-            first, other = self.update(mean, covariance, sensor, state.measurement[sensor])
-            mean = np.where(granted[sensor], first, mean)
-            covariance = np.where(granted[sensor], linalg.symmetrise(other), covariance)
+    def observe(self, state: FilteredEstimate, measurement: Array) -> FilteredEstimate:
+        """Take the measurement."""
+        return replace(state, measurement=measurement)
+
+    def update(self, state: FilteredEstimate, reception: Reception) -> FilteredEstimate:
+        """Update the centre with the measurements that arrive, sensor by sensor."""
+        mean, covariance, arrived = state.prior_mean, state.prior_covariance, reception.arrived
+        for sensor in np.flatnonzero(arrived.any(1)).tolist():
+            first, other = self.system.update(mean, covariance, sensor, state.measurement[sensor])
+            mean = np.where(arrived[sensor], first, mean)
+            covariance = np.where(arrived[sensor], linalg.symmetrise(other), covariance)
         return replace(
             state,
-            held=np.where(granted[:, None], state.measurement, state.held),
-            age=np.where(granted, 0.0, state.age),
+            held=np.where(arrived[:, None], state.measurement, state.held),
+            age=np.where(arrived, 0.0, state.age),
             mean=mean,
             covariance=covariance,
         )
 
-    def read(self, state: FilteredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+    def read(self, state: FilteredEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals."""
         return {
             "measurement": state.measurement,
@@ -260,24 +346,9 @@ class NonlinearSystem(System[FilteredState]):
             "variance_reduction": lambda: self._reduction(state),
         }
 
-    def visible(self, state: FilteredState) -> FilteredState:
-        """Return the state without the truth."""
-        return replace(state, truth=np.full_like(state.truth, np.nan))
-
-    @property
-    def imagination_channels(self) -> int:
-        """Number of states."""
-        return len(self.state_names)
-
-    def imagine(
-        self, state: FilteredState, mean: Array, covariance: Array, noise: Array
-    ) -> FilteredState:
-        """Return the state with a truth drawn from N(mean, covariance)."""
-        return replace(state, truth=linalg.draw_normal(mean, covariance, noise))
-
     def adopt(
-        self, state: FilteredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]
-    ) -> FilteredState:
+        self, state: FilteredEstimate, mean: Array, covariance: Array, runs: NDArray[np.bool_]
+    ) -> FilteredEstimate:
         """Replace the centre's estimate in ``runs`` (N,)."""
         return replace(
             state,
@@ -285,64 +356,33 @@ class NonlinearSystem(System[FilteredState]):
             covariance=np.where(runs, covariance, state.covariance),
         )
 
-    def local_means(self, state: FilteredState) -> Array:
+    def local_means(self, state: FilteredEstimate) -> Array:
         """Return the centre's mean for every sensor (l, n, N); the system has no nodes."""
-        return np.broadcast_to(state.mean, (self.sensor_count, *state.mean.shape))
+        return np.broadcast_to(state.mean, (self.system.sensors, *state.mean.shape))
 
-    def open_loop(self, horizon: int) -> Array:
-        """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""
-        return self._silence(horizon)[1]
+    def _expected(self, state: FilteredEstimate) -> Array:
+        shape = (self.system.sensors * self.system.channels, state.prior_mean.shape[-1])
+        return self.system.measured(state.prior_mean, np.zeros(shape))
 
-    def _measured(self, state: Array, noise: Array) -> Array:
-        shape = (self.sensor_count, self.channels, state.shape[-1])
-        values = np.asarray(self.measure(state, noise.reshape(shape)), dtype=np.float64)
-        if values.shape != shape:
-            raise ValueError(
-                f"measure of shape {values.shape} is not allowed: it must be {shape}, sensors, "
-                "channels and runs"
-            )
-        return values
-
-    def _expected(self, state: FilteredState) -> Array:
-        shape = (self.sensor_count * self.channels, state.prior_mean.shape[-1])
-        return self._measured(state.prior_mean, np.zeros(shape))
-
-    def _deviation(self, state: FilteredState) -> Array:
+    def _deviation(self, state: FilteredEstimate) -> Array:
         """Return the innovation's deviation, by secants over one deviation of each source."""
         mean = state.prior_mean
-        nothing = np.zeros((self.sensor_count * self.channels, mean.shape[-1]))
-        variance = (self._measured(mean, nothing + 1.0) - self._measured(mean, nothing)) ** 2
+        nothing = np.zeros((self.system.sensors * self.system.channels, mean.shape[-1]))
+        variance = (
+            self.system.measured(mean, nothing + 1.0) - self.system.measured(mean, nothing)
+        ) ** 2
         root = linalg.root(state.prior_covariance)
         for column in range(root.shape[1]):
-            ahead = self._measured(mean + root[:, column], nothing)
-            behind = self._measured(mean - root[:, column], nothing)
+            ahead = self.system.measured(mean + root[:, column], nothing)
+            behind = self.system.measured(mean - root[:, column], nothing)
             variance = variance + (0.5 * (ahead - behind)) ** 2
         return np.sqrt(variance) + 1e-12
 
-    def _reduction(self, state: FilteredState) -> Array:
+    def _reduction(self, state: FilteredEstimate) -> Array:
         mean, covariance = state.prior_mean, state.prior_covariance
         expected = self._expected(state)
         single = [
-            linalg.trace(self.update(mean, covariance, sensor, expected[sensor])[1])
-            for sensor in range(self.sensor_count)
+            linalg.trace(self.system.update(mean, covariance, sensor, expected[sensor])[1])
+            for sensor in range(self.system.sensors)
         ]
         return linalg.trace(covariance) - np.array(single)
-
-    @functools.cached_property
-    def _typical(self) -> tuple[Array, Array]:
-        """Root mean square and open-loop error variance (n,) of each state, over ten steps."""
-        moment, error = self._silence(10)
-        return np.sqrt(np.maximum(moment, 1e-12)), np.maximum(error, 1e-12)
-
-    def _silence(self, horizon: int) -> tuple[Array, Array]:
-        """Mean second moment and squared error (n,) over t = 1..horizon without transmissions."""
-        generator = np.random.default_rng(_SEED)
-        state = self.start(generator.standard_normal((self.start_channels, _RUNS)))
-        nobody = np.zeros((self.sensor_count, _RUNS), dtype=np.bool_)
-        moment = error = np.zeros(len(self.state_names))
-        for _ in range(horizon):
-            noise = generator.standard_normal((self.noise_channels, _RUNS))
-            state = self.deliver(self.sense(state, noise), nobody)
-            moment = moment + (state.truth**2).mean(-1)
-            error = error + ((state.truth - state.mean) ** 2).mean(-1)
-        return moment / horizon, error / horizon

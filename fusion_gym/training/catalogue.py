@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from fusion_gym import zoo
-from fusion_gym.core.system import MEANING
+from fusion_gym.core.knowledge import MEANING
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import short
 from fusion_gym.envs.pages import page
@@ -68,7 +68,7 @@ def _page(owner: Any, meaning: str) -> str:
 
 
 def _environment(env_id: str) -> str:
-    signals = make_task(env_id).system.signals
+    signals = make_task(env_id).estimator.signals
     rows = [(f"`{s.name}`", s.axes, s.knowledge, s.meaning) for s in signals]
     head = ("signal", "axes", "known to", "meaning")
     return f"{page(env_id)}\n## Signals\n{table(head, rows)}\n"
@@ -97,7 +97,7 @@ def _signals() -> dict[str, Entry]:
     """Return the signals of all environments, each with its environments."""
     rows: dict[str, list[tuple[str, ...]]] = {}
     for env_id in ENVIRONMENTS:
-        for signal in make_task(env_id).system.signals:
+        for signal in make_task(env_id).estimator.signals:
             known, place = MEANING[signal.knowledge], env_id.rpartition("/")[2]
             row = (place, signal.axes, known, signal.meaning)
             rows.setdefault(signal.name, []).append(row)

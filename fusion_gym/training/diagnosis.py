@@ -110,7 +110,7 @@ def warn_of_unused_tokens(task: Task, tokens: float) -> None:
     """Warn if an agent at its lowest price spends less than half of the sustained tokens a step."""
     sustained = sustained_tokens(task)
     share = tokens / sustained if sustained else 1.0
-    if share < 0.5 and not task.bucket.unlimited:
+    if share < 0.5 and not task.network.bucket.unlimited:
         warnings.warn(
             f"at its lowest price the agent spends {share:.0%} of the tokens that the bucket "
             "sustains: a lower price, or a reward_scale above the present "

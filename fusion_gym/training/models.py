@@ -8,9 +8,9 @@ from gymnasium.spaces import Discrete, MultiBinary
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import System
+from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.task import Task
-from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
+from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_estimator
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SensorView
 from fusion_gym.errors import forbidden
@@ -31,7 +31,7 @@ _LEVEL = 0.99  # of the intervals together: one false warning in a hundred setti
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     """Return the training environment."""
     name, local = experiment.algorithm.name, experiment.environment.local
-    many = not local and task.action != "discrete" and task.access != "single"
+    many = not local and task.action != "discrete" and task.network.access != "single"
     if TABLE[name].discrete_only and many:
         reason = "set the environment's option action: discrete"
         raise forbidden("action", task.action, reason, f"with algorithm {name!r}")
@@ -52,15 +52,15 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     return PrivilegedVecEnv(task, error=training.error, reference=reference, **runs)
 
 
-def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -> System[Any]:
-    """Return the system that processes every measurement, if possible the task's memory."""
-    if task.memory_system is not None and error_filter in (
+def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -> Estimator[Any]:
+    """Return the estimator that processes every measurement, if possible the task's memory."""
+    if task.memory_estimator is not None and error_filter in (
         None,
         where.options.get("memory_filter"),
     ):
-        return task.memory_system
+        return task.memory_estimator
     try:
-        return reference_system(where.id, where.options, error_filter)
+        return reference_estimator(where.id, where.options, error_filter)
     except ConfigurationError as error:
         if error_filter is None:
             raise
@@ -101,7 +101,7 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
     assert isinstance(space, Discrete)
     if isinstance(env.view, SensorView):
         return np.array([0.0, odds])
-    if env.task.access == "single":
+    if env.task.network.access == "single":
         if sensors * rate >= 1.0:
             allowed = f"< 1/{sensors}, because one of {sensors} sensors transmits in a step"
             raise refusal("initial_rate", rate, allowed)

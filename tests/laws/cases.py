@@ -12,8 +12,8 @@ from own_system import OWN_ID
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task, make_bucket
 from fusion_gym.envs.registration import ENVIRONMENTS
 
@@ -136,7 +136,8 @@ class Case:
             task = self.task()
             selection: Any = SimpleNamespace(**task.settings | more)
             bucket = make_bucket(selection, task.sensors)
-            return replace(task, bucket=bucket, access=selection.access, settings=vars(selection))
+            network = replace(task.network, bucket=bucket, access=selection.access)
+            return replace(task, network=network, settings=vars(selection))
         return fusion_gym.make_task(self.env_id, **self.options | more)
 
     def batch(
@@ -173,12 +174,12 @@ each_id = pytest.mark.parametrize("env_id", IDS, ids=short)
 def requests(task: Task, runs: int, steps: int, rate: float = 0.4) -> NDArray[np.bool_]:
     """Random requests (steps, sensors, runs), always the same; one a step with single access."""
     request = np.random.default_rng(7).random((steps, task.sensors, runs)) < rate
-    return request & (request.cumsum(1) == 1) if task.access == "single" else request
+    return request & (request.cumsum(1) == 1) if task.network.access == "single" else request
 
 
 def actions(task: Task, request: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Actions (runs, …) of a scheduler for the requests (sensors, runs)."""
-    if task.access == "single":
+    if task.network.access == "single":
         return np.where(request.any(0), 1 + request.argmax(0), 0)
     if task.action == "discrete":
         return (request * 2 ** np.arange(task.sensors)[:, None]).sum(0)
@@ -186,5 +187,5 @@ def actions(task: Task, request: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def read(batch: EpisodeBatch) -> Signals:
-    """All signals of a system, withheld ones too."""
-    return Signals(dict(batch.task.system.read(batch.state)))
+    """All signals of an estimator, withheld ones too."""
+    return Signals(batch.read())

@@ -1,23 +1,53 @@
 """An environment as a user would write one: a random walk, seen through noise by one sensor."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fusion_gym import Block, CommonOptions, Estimator, Plant, Reception, Scenario, Signal
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.system import Block, Signal, SignalArray, System, age_block
+from fusion_gym.core.estimator import SignalValues
+from fusion_gym.core.knowledge import age_block
 
 OWN_ID = "mine/RandomWalk-v0"
 
 
 @dataclass(slots=True)
-class WalkState:
-    """One number a run each, (1, N); ``age`` (1, N)."""
+class Walk:
+    """The truth (1, N) and its measurement (1, 1, N)."""
 
     truth: Array
+    measurement: Array
+
+
+@dataclass(frozen=True)
+class RandomWalk(Plant[Walk]):
+    """x' = x + w, y = x + v, w ~ N(0, q), v ~ N(0, r)."""
+
+    q: float
+    r: float
+
+    state_names = ("x",)
+    sensor_count = 1
+    noise_channels = 2
+    start_channels = 1
+
+    def start(self, noise: Array) -> tuple[Walk, None]:
+        return Walk(noise.copy(), np.zeros_like(noise)[None]), None
+
+    def sense(self, state: Walk, noise: Array) -> Walk:
+        truth = state.truth + np.sqrt(self.q) * noise[:1]
+        return Walk(truth, (truth + np.sqrt(self.r) * noise[1:])[None])
+
+    def open_loop(self, horizon: int) -> Array:
+        return np.array([1.0 + self.q * (horizon + 1) / 2])
+
+
+@dataclass(slots=True)
+class WalkEstimate:
+    """``measurement`` and ``held`` (1, 1, N), ``age`` (1, N), means (1, N) and variances (1, N)."""
+
     measurement: Array
     held: Array
     age: Array
@@ -28,22 +58,18 @@ class WalkState:
 
 
 @dataclass(frozen=True)
-class RandomWalk(System[WalkState]):
-    """x' = x + w, y = x + v, w ~ N(0, q), v ~ N(0, r): a Kalman filter at the centre."""
+class WalkFilter(Estimator[WalkEstimate]):
+    """A Kalman filter at the centre."""
 
     q: float
     r: float
 
-    sensor_count = 1
-    state_names = ("x",)
-    noise_channels = 2
-    start_channels = 1
     signals = (
         Signal("measurement", "own", "(sensors, 1, N)", "the new measurement"),
         Signal("innovation", "own", "(sensors, 1, N)", "that minus its expectation"),
-        Signal("innovation_deviation", "centre", "(sensors, 1, N)", "its deviation"),
-        Signal("held", "centre", "(sensors, 1, N)", "the last delivered measurement"),
-        Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
+        Signal("innovation_deviation", "centre", "(sensors, 1, N)", "its deviation", "own"),
+        Signal("held", "centre", "(sensors, 1, N)", "the last delivered measurement", "own"),
+        Signal("age", "centre", "(sensors, N)", "steps since the last delivery", "own"),
         Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
         Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
     )
@@ -56,63 +82,49 @@ class RandomWalk(System[WalkState]):
             Block("spread", "ln(P/q) over ten", self._spread, node="broadcast", limit=5.0),
         )
 
-    def start(self, noise: Array) -> WalkState:
-        zero, ones = np.zeros_like(noise), np.ones_like(noise)
-        return WalkState(noise.copy(), zero, zero, zero, zero, ones, zero, ones)
+    def start(self, measurement: Array, announcement: None) -> WalkEstimate:
+        zero = np.zeros_like(measurement[0])
+        return WalkEstimate(measurement, measurement, zero, zero, zero + 1.0, zero, zero + 1.0)
 
-    def sense(self, state: WalkState, noise: Array) -> WalkState:
-        truth = state.truth + np.sqrt(self.q) * noise[:1]
+    def predict(self, state: WalkEstimate) -> WalkEstimate:
+        variance = state.variance + self.q
+        return replace(state, age=state.age + 1.0, prior=state.mean, prior_variance=variance)
+
+    def observe(self, state: WalkEstimate, measurement: Array) -> WalkEstimate:
+        return replace(state, measurement=measurement)
+
+    def update(self, state: WalkEstimate, reception: Reception) -> WalkEstimate:
+        arrived, surprise = reception.arrived, state.measurement[0] - state.prior
+        gain = np.where(arrived, state.prior_variance / (state.prior_variance + self.r), 0.0)
         return replace(
             state,
-            truth=truth,
-            measurement=truth + np.sqrt(self.r) * noise[1:],
-            age=state.age + 1.0,
-            prior=state.mean,
-            prior_variance=state.variance + self.q,
-        )
-
-    def deliver(self, state: WalkState, granted: NDArray[np.bool_]) -> WalkState:
-        gain = np.where(granted, state.prior_variance / (state.prior_variance + self.r), 0.0)
-        return replace(
-            state,
-            held=np.where(granted, state.measurement, state.held),
-            age=np.where(granted, 0.0, state.age),
-            mean=np.where(
-                granted, state.prior + gain * (state.measurement - state.prior), state.prior
-            ),
+            held=np.where(arrived, state.measurement, state.held),
+            age=np.where(arrived, 0.0, state.age),
+            mean=np.where(arrived, state.prior + gain * surprise, state.prior),
             variance=(1.0 - gain) * state.prior_variance,
         )
 
-    def read(self, state: WalkState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+    def read(self, state: WalkEstimate, failure: Array | None = None) -> SignalValues:
         return {
-            "measurement": state.measurement[:, None],
-            "innovation": lambda: (state.measurement - state.prior)[:, None],
+            "measurement": state.measurement,
+            "innovation": lambda: state.measurement - state.prior,
             "innovation_deviation": lambda: np.sqrt(state.prior_variance + self.r)[:, None],
-            "held": state.held[:, None],
+            "held": state.held,
             "age": state.age,
             "prior_mean": state.prior,
             "prior_covariance": state.prior_variance[:, None],
         }
 
-    def visible(self, state: WalkState) -> WalkState:
-        return replace(state, truth=np.full_like(state.truth, np.nan))
+    def covariance(self, state: WalkEstimate) -> Array:
+        return state.variance[:, None]
 
-    def truth(self, state: WalkState) -> Array:
-        return state.truth
-
-    def fused(self, state: WalkState) -> tuple[Array, Array]:
-        return state.mean, state.variance[:, None]
-
-    def local_means(self, state: WalkState) -> Array:
+    def local_means(self, state: WalkEstimate) -> Array:
         return state.mean[None]
 
-    def open_loop(self, horizon: int) -> Array:
-        return np.array([1.0 + self.q * (horizon + 1) / 2])
+    def _surprise(self, state: WalkEstimate) -> Any:
+        return (state.measurement[0] - state.prior) / np.sqrt(state.prior_variance + self.r)
 
-    def _surprise(self, state: WalkState) -> Array:
-        return (state.measurement - state.prior) / np.sqrt(state.prior_variance + self.r)
-
-    def _spread(self, state: WalkState) -> Array:
+    def _spread(self, state: WalkEstimate) -> Any:
         return 0.1 * np.log(state.prior_variance[0] / self.q)
 
 
@@ -127,4 +139,4 @@ class WalkOptions(CommonOptions):
 
 def build(options: WalkOptions) -> Scenario:
     """The scenario of these options."""
-    return Scenario(options, RandomWalk(options.q, options.r))
+    return Scenario(options, RandomWalk(options.q, options.r), WalkFilter(options.q, options.r))

@@ -66,7 +66,7 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
             fusion_gym.parallel_env(case.env_id, **case.options)
         return
     env, task = fusion_gym.parallel_env(case.env_id, **case.options), case.task()
-    view, bucket = SensorView(task), task.bucket
+    view, bucket = SensorView(task), task.network.bucket
     batch = case.batch(1, 7, view.owner)
     observations, _ = env.reset(seed=7)
     assert env.possible_agents == [f"sensor_{m}" for m in range(task.sensors)]

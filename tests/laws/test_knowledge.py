@@ -11,9 +11,11 @@ from cases import FREE, Array, Case, each_case, each_id, read, requests
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.estimator import Reception
+from fusion_gym.core.knowledge import SignalError, Signals, covers
 from fusion_gym.core.options import Broadcast
-from fusion_gym.core.runs import Runs
-from fusion_gym.core.system import SignalError, Signals, covers
+from fusion_gym.core.plant import Plant
+from fusion_gym.core.runs import Outcome, Runs
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import present_id
 from fusion_gym.envs.views import SensorView
@@ -26,57 +28,92 @@ STEPS = 3
 # --- the truth ------------------------------------------------------------------------------------
 
 
-def blind(batch: EpisodeBatch) -> Runs:
-    """The runs, with nothing left of what no policy may know."""
-    branch, task = batch.branch(), batch.task
-    branch.state, states = task.system.visible(branch.state), branch.memory.states
-    if states is not None:
-        filters = {"every": task.memory_system, "own": task.memory_system, "single": task.system}
-        visible = {
-            name: system.visible(part)
-            for name, system in filters.items()
-            if system is not None and (part := getattr(states, name)) is not None
-        }
-        states = dataclasses.replace(states, **visible)
-    branch.memory = branch.memory.with_states(states)
-    return branch
+@dataclasses.dataclass(slots=True)
+class Replaced:
+    """A plant's state behind other values of its truth."""
+
+    actual: Any
+    truth: Array
+    measurement: Array
 
 
-def visible_entries(runs: Runs) -> dict[str, Array]:
-    """Everything that policies may look at, but the state to plan with."""
-    signals = runs.signals()
-    names = [name for name in signals if name not in ("model", "beliefs", "own_beliefs")]
-    return {name: np.asarray(signals[name]) for name in names}
+class OtherTruth(Plant[Replaced]):
+    """A plant whose measurements stay while its truth is replaced."""
+
+    sensor_count = property(lambda self: self.plant.sensor_count)
+    noise_channels = property(lambda self: self.plant.noise_channels)
+    start_channels = property(lambda self: self.plant.start_channels)
+
+    def __init__(self, plant: Plant[Any]) -> None:
+        self.plant, self.draws = plant, np.random.default_rng(3)
+        self.state_names, self.nature = plant.state_names, plant.nature
+
+    def start(self, noise: Array) -> tuple[Replaced, Any]:
+        state, announcement = self.plant.start(noise)
+        return self._replaced(state), announcement
+
+    def sense(self, state: Replaced, noise: Array) -> Replaced:
+        return self._replaced(self.plant.sense(state.actual, noise))
+
+    def available(self, state: Replaced) -> Any:
+        return self.plant.available(state.actual)
+
+    def open_loop(self, horizon: int) -> Array:
+        return self.plant.open_loop(horizon)
+
+    def _replaced(self, state: Any) -> Replaced:
+        other = 1e3 * self.draws.standard_normal(self.plant.truth(state).shape)
+        return Replaced(state, other, self.plant.measurement(state))
+
+
+def leaves(part: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """The arrays of a state, a memory or a tuple of them, by name."""
+    if dataclasses.is_dataclass(part):
+        parts = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+    elif isinstance(part, dict):
+        parts = part
+    elif isinstance(part, tuple):
+        parts = dict(enumerate(part))
+    else:
+        yield name, part
+        return
+    for key, value in parts.items():
+        yield from leaves(value, f"{name}.{key}")
+
+
+OF_ERRORS = ("reward", "reward_error", "error", "squared_error", "diverged")
+
+
+def shown(batch: EpisodeBatch, outcome: Outcome | None) -> dict[str, Any]:
+    """The estimator's states, signals, observation and infos, without what the error decides."""
+    signals = batch.signals()
+    beliefs = ("beliefs", "own_beliefs")
+    parts = {name: signals[name] for name in signals if name not in beliefs}
+    infos = {} if outcome is None else outcome._asdict()
+    parts |= {name: value for name, value in infos.items() if name not in OF_ERRORS}
+    own = {"estimate": batch.state.estimate, "memory": batch.memory.states, "signal": parts}
+    return dict(leaves(own))
 
 
 @pytest.mark.parametrize("owner", ["scheduler", "own"])
 @each_case
 def test_nothing_shown_depends_on_the_truth(case: Case, owner: Any) -> None:
-    """A truth is left in the state to plan with only where it has been measured exactly."""
+    """Neither states of estimators, signals, observation nor infos, behind equal measurements."""
     if owner == "own" and not case.local:
         return
-    batch = case.batch(owner=owner, **FREE)
-    system = batch.task.system
-    for request in requests(batch.task, 3, STEPS):
-        seeing, observed = visible_entries(batch), visible_entries(blind(batch))
-        assert observed.keys() == seeing.keys()
-        for name, value in seeing.items():
-            np.testing.assert_array_equal(observed[name], value, err_msg=name)
-            assert np.isfinite(value).all(), name
-        measured = Signals(dict(system.read(batch.state)))["measurement"].reshape(-1, 3)
-        model = system.visible(batch.state)
-        truth = system.truth(model)
-        assert (np.isnan(truth) | (truth[:, None] == measured).any(1)).all()
-        planned, arrives = (
-            system.deliver(model, request),
-            ~getattr(batch.state, "lost", request & False),
-        )
-        stored = (arrives | ~request).all(0)
-        batch.step(request)
-        for part, real in zip(system.fused(planned), system.fused(batch.delivered), strict=True):
-            assert np.isfinite(part).all()
-            if batch.task.packet == "measurement":
-                np.testing.assert_array_equal(part[..., stored], real[..., stored])
+    task = case.task(**FREE)
+    other = dataclasses.replace(task, plant=OtherTruth(task.plant), backend="numpy")
+    batches = [EpisodeBatch.seeded(own, 3, 0, owner) for own in (task, other)]
+    outcomes: list[Outcome | None] = [None, None]
+    for request in requests(task, 3, STEPS):
+        actual, replaced = map(shown, batches, outcomes)
+        assert actual.keys() == replaced.keys()
+        for name, value in actual.items():
+            np.testing.assert_array_equal(value, replaced[name], err_msg=name)
+        outcomes = [batch.step(request) for batch in batches]
+        assert outcomes[0] is not None
+        assert outcomes[1] is not None
+        assert (outcomes[0].error != outcomes[1].error).any()
 
 
 @each_id
@@ -84,7 +121,7 @@ def test_the_centre_is_shown_nothing_of_the_sensors(env_id: str) -> None:
     """Their signals are refused by name; who decides by itself cannot see through the centre."""
     task = fusion_gym.make_task(env_id, information="centre")
     signals, hidden = EpisodeBatch.seeded(task, 2, 0).signals(), 0
-    for signal in task.system.signals:
+    for signal in task.estimator.signals:
         if covers("centre", signal.knowledge):
             assert signal.name in signals
             continue
@@ -93,7 +130,7 @@ def test_the_centre_is_shown_nothing_of_the_sensors(env_id: str) -> None:
             signals[signal.name]
         hidden += 1
     assert hidden
-    assert "model" not in signals
+    assert "estimate" not in signals
     with pytest.raises(ConfigurationError, match="information = 'centre'"):
         SensorView(task)
 
@@ -107,7 +144,7 @@ def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
     sensor alone. That sensor sends nothing: neither the centre nor another sensor notices."""
     batch = case.batch(1, owner="own" if case.local else None, **FREE)
     task, view = batch.task, SensorView(batch.task) if case.local else None
-    channels = np.arange(task.system.noise_channels)
+    channels = np.arange(task.plant.noise_channels)
     reached = np.zeros((task.sensors, len(channels)), dtype=np.bool_)
     for signals, _ in steps(batch, np.append(-1, channels), np.zeros((STEPS, task.sensors, 1))):
         reached |= differs(signals["measurement"], 0)[:, 1:]
@@ -119,12 +156,12 @@ def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
     others, noticed = np.arange(task.sensors)[:, None] != sensor, False
     sent = requests(task, 1, STEPS) & others[None] & (task.packet == "measurement")
     for signals, runs in steps(batch, changed, sent):
-        for signal in task.system.signals:
+        for signal in task.estimator.signals:
             value = signals[signal.name]
             if not covers("centre", signal.knowledge):
                 apart = differs(value, base) & others if signal.axes.startswith("(sen") else False
                 assert not np.any(apart), signal.name
-            elif signal.name != "channel_state":
+            else:
                 assert not differs(value[None], base).any(), signal.name
         if view is not None:
             rows = view.rows(runs.observe()).reshape(len(sensor), task.sensors, -1)
@@ -149,7 +186,7 @@ def steps(batch: EpisodeBatch, changed: Array, sent: Array) -> Iterator[tuple[Si
         noise = np.repeat(draw.standard_normal((runs.channels, 1)), len(changed), axis=1)
         noise[changed[turned], turned] *= -1.5
         runs.step(request.astype(np.bool_), noise)
-        yield Signals(dict(batch.task.system.read(runs.state))), runs
+        yield Signals(runs.read()), runs
 
 
 def differs(value: Array, base: Any) -> Array:
@@ -161,19 +198,17 @@ def differs(value: Array, base: Any) -> Array:
 # --- what a delivery brings -----------------------------------------------------------------------
 
 
-def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
-    """The centre's mean and covariance after these packets, none of which is lost."""
-    if hasattr(state, "lost"):
-        state = dataclasses.replace(state, lost=np.zeros_like(state.lost))
-    granted = np.zeros((system.sensor_count, system.truth(state).shape[-1]), dtype=np.bool_)
-    granted[list(sensors)] = True
-    result: tuple[Array, Array] = system.fused(system.deliver(state, granted))
-    return result
+def after(estimator: Any, batch: EpisodeBatch, *sensors: int) -> tuple[Array, Array]:
+    """The centre's mean and covariance after the arrival of these packets."""
+    arrived = np.zeros((batch.task.sensors, batch.num_envs), dtype=np.bool_)
+    arrived[list(sensors)] = True
+    updated = estimator.update(batch.state.estimate, Reception(arrived))
+    return estimator.mean(updated), estimator.covariance(updated)
 
 
 def fused_trace(batch: EpisodeBatch, weights: Array, *sensors: int) -> Array:
     """The weighted trace (N,) after these packets."""
-    variances = np.einsum("iir->ir", after(batch.task.system, batch.state, *sensors)[1])
+    variances = np.einsum("iir->ir", after(batch.task.estimator, batch, *sensors)[1])
     return np.asarray((weights.reshape(-1, 1) * variances).sum(0))
 
 
@@ -202,11 +237,11 @@ def deterministic_variance(case: Case) -> bool:
 def test_variance_signals_are_what_a_delivery_brings(case: Case) -> None:
     """The traces if nobody delivers, if one sensor does, and those before it in greedy order."""
     batch = case.batch(**FREE)
-    system: Any = batch.task.system
+    estimator: Any = batch.task.estimator
     if not deterministic_variance(case) or "variance_reduction" not in read(batch):
         return
     for request in requests(batch.task, 3, 2 * STEPS):
-        signals, weights = read(batch), system.state_weights
+        signals, weights = read(batch), estimator.state_weights
         assert (weights == 1.0).all() or np.all(weights == batch.task.reward.state_weights.ravel())
         silent = signals["silent_variance"]
         np.testing.assert_allclose(silent, fused_trace(batch, weights), rtol=1e-9)
@@ -214,7 +249,7 @@ def test_variance_signals_are_what_a_delivery_brings(case: Case) -> None:
         np.testing.assert_allclose(signals["variance_reduction"], silent - each, 1e-7, 1e-9)
         if "greedy_variance" in signals:
             prior, greedy = signals["prior_covariance"], np.array(signals["greedy_variance"])
-            np.testing.assert_array_equal(prior, after(system, batch.state)[1])
+            np.testing.assert_array_equal(prior, after(estimator, batch)[1])
             np.testing.assert_allclose(greedy.max(0), signals["centre_variance"], rtol=1e-9)
             check_greedy(greedy, partial(fused_trace, batch, np.ones_like(weights)))
         batch.step(request)
@@ -273,9 +308,11 @@ class Beside:
         self.batch = EpisodeBatch.seeded(task, 3, 4, owner)
         self.others: list[tuple[EpisodeBatch, Callable[[Array], Array]]] = []
 
-    def add(self, system: Any, sent: Callable[[Array], Array]) -> EpisodeBatch:
+    def add(self, estimator: Any, sent: Callable[[Array], Array]) -> EpisodeBatch:
         """One with this filter that gets the packets ``sent`` (sensors, N)."""
-        plain = dataclasses.replace(self.task, system=system, memory=False, memory_system=None)
+        plain = dataclasses.replace(
+            self.task, estimator=estimator, memory=False, memory_estimator=None
+        )
         self.others.append((EpisodeBatch.seeded(plain, 3, 4), sent))
         return self.others[-1][0]
 
@@ -298,22 +335,22 @@ def test_a_sensor_believes_by_what_it_measured_and_received(env_id: str, broadca
     task = fusion_gym.make_task(env_id, memory=True, broadcast=broadcast, **FREE, **more)
     beside, own, single, packets = Beside(task, "own"), [], [], broadcast == "packets"
     for itself in (np.arange(task.sensors)[:, None] == s for s in range(task.sensors)):
-        if task.memory_system is not None:
-            own.append(beside.add(task.memory_system, lambda g, i=itself: (g & packets) | i))
-        single.append(beside.add(task.system, lambda g, i=itself: g & i))
+        if task.memory_estimator is not None:
+            own.append(beside.add(task.memory_estimator, lambda g, i=itself: (g & packets) | i))
+        single.append(beside.add(task.estimator, lambda g, i=itself: g & i))
     distant = broadcast == "none" or (broadcast == "estimate" and not task.feedback)
     for request in requests(task, 3, STEPS):
         batch = beside.batch
         signals = batch.signals()
         for sensor in range(task.sensors):
             centre = single[sensor] if broadcast == "none" else batch
-            silent = after(task.system, centre.state)
-            sent = after(task.system, (single[sensor] if distant else batch).state, sensor)
+            silent = after(task.estimator, centre)
+            sent = after(task.estimator, single[sensor] if distant else batch, sensor)
             if broadcast == "estimate" and distant:
                 sent = joined(silent, sent)
             best = sent
             if own:
-                best = after(task.memory_system, own[sensor].state, sensor)
+                best = after(task.memory_estimator, own[sensor], sensor)
                 if broadcast == "estimate":
                     best = joined(sent if task.feedback else silent, best)
             check(signals["own_difference"][sensor], best[0] - silent[0])
@@ -329,22 +366,18 @@ def test_a_scheduler_believes_by_everything_measured(env_id: str) -> None:
     task = fusion_gym.make_task(env_id, memory=True, **FREE, **more)
     beside = Beside(task, "scheduler")
     whole = (
-        beside.add(task.memory_system, lambda granted: granted | True)
-        if task.memory_system
+        beside.add(task.memory_estimator, lambda granted: granted | True)
+        if task.memory_estimator
         else None
     )
     for request in requests(task, 3, STEPS):
         batch = beside.batch
-        system, state = (
-            (task.system, batch.state) if whole is None else (task.memory_system, whole.state)
-        )
-        best, silent = (
-            after(system, state, *range(task.sensors))[0],
-            after(task.system, batch.state),
-        )
+        most = (task.estimator, batch) if whole is None else (task.memory_estimator, whole)
+        best = after(*most, *range(task.sensors))[0]
+        silent = after(task.estimator, batch)
         check(batch.signals()["belief_difference"], best - silent[0])
         for sensor in range(task.sensors):
-            sent = after(task.system, batch.state, sensor)
+            sent = after(task.estimator, batch, sensor)
             value = worth(task, best, silent[0], sent[0]) * chance(batch)[sensor]
             check(batch.signals()["transmission_value"][sensor], value)
         beside.step(request)
@@ -358,9 +391,8 @@ def worth(task: Task, best: Array, silent: Array, sent: Array) -> Array:
 
 def chance(batch: EpisodeBatch) -> Array:
     """Probability (sensors, N) that a packet sent now arrives."""
-    if batch.task.system.offers("arrival_probability"):
-        return batch.task.system.arrival_probability(batch.state)
-    return np.ones((batch.task.sensors, batch.num_envs))
+    arrival = batch.arrival_probability()
+    return np.ones((batch.task.sensors, batch.num_envs)) if arrival is None else arrival
 
 
 def check(values: Array, expected: Array) -> None:

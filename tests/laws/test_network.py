@@ -59,7 +59,8 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
     batch, turns = EpisodeBatch.seeded(task, 40, 0), np.zeros(task.sensors)
     for step, target in enumerate(np.random.default_rng(0).random((STEPS, task.sensors, 40)) < 0.7):
         admitted = batch.signals()["admitted"]
-        sampled = read(batch).get("sampled", True) | ~task.system.offers("available")
+        available = task.plant.available(batch.state.plant)
+        sampled = True if available is None else available[0]
         granted = batch.step(target).granted
         if access == "single":
             np.testing.assert_array_equal(granted.sum(0), (target & sampled).any(0))
@@ -67,14 +68,14 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
             continue
         np.testing.assert_array_equal(granted, target & admitted)
         turns += admitted.sum(1)
-        if task.system.offers("available"):
+        if available is not None:
             assert not (admitted & ~sampled).any()
             continue
         if access == "round_robin":
             assert (admitted == (np.arange(task.sensors) == step % task.sensors)[:, None]).all()
         else:
             assert (admitted.sum(0) == (task.sensors if access == "any" else 1)).all()
-    if access == "random" and not task.system.offers("available"):
+    if access == "random" and available is None:
         mean = turns.sum() / task.sensors
         assert (np.abs(turns - mean) < 4.0 * np.sqrt(mean) * (task.sensors > 1) + 1e-9).all()
 
@@ -85,7 +86,8 @@ def test_sensors_that_request_alike_are_granted_alike(env_id: str, rate: float) 
     """In every window their grants differ by at most one, by default and with one grant a step."""
     batch = Case(env_id, THREE.get(short(env_id), {})).batch(**SCARCE | {"token_rate": rate})
     for access in ("any", "single"):
-        task = dataclasses.replace(batch.task, access=access)
+        network = dataclasses.replace(batch.task.network, access=access)
+        task = dataclasses.replace(batch.task, network=network)
         for name in ("always", "round_robin"):
             policy, batch = make_policy(name, task), EpisodeBatch.seeded(task, 1, 0)
             grants = np.array([batch.step(policy(batch.signals())).granted for _ in range(60)])
@@ -123,10 +125,11 @@ def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
         assert (price == selection["cost_weight"]).all()
     for request in requests(task, 3, STEPS):
         outcome = batch.step(request)
-        mean, covariance = task.system.fused(batch.delivered)
-        actual = task.system.truth(batch.delivered) - mean
-        if task.system.offers("available"):
-            actual *= task.system.available(batch.delivered)[1]
+        truth, estimate, *_ = batch.delivered
+        covariance = task.estimator.covariance(estimate)
+        actual = task.plant.truth(truth) - task.estimator.mean(estimate)
+        if (available := task.plant.available(truth)) is not None:
+            actual *= available[1]
         np.testing.assert_allclose(outcome.error, actual)
         size = outcome.error**2
         if selection["error"] == "trace":
@@ -145,7 +148,7 @@ def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
 def test_a_delivery_begins_age_and_held_value_anew(case: Case) -> None:
     """And nothing else does. A packet may be lost, or hold nothing where nothing is sampled."""
     batch = case.batch()
-    loses, arrived = batch.task.system.offers("arrival_probability"), 0
+    loses, arrived = batch.arrival_probability() is not None, 0
     for request in requests(batch.task, 3, STEPS):
         before = read(batch)
         age, new, held = (np.copy(before[name]) for name in ("age", "measurement", "held"))
@@ -174,7 +177,8 @@ def test_an_estimate_is_adopted_where_a_packet_arrives(env_id: str) -> None:
     for request in requests(task, 3, 2 * STEPS, rate=0.7):
         best, silent = batch.beliefs().best, batch.beliefs().silent
         granted = batch.step(request).granted.any(0)
-        mean, covariance = task.system.fused(batch.delivered)
+        estimate = batch.delivered.estimate
+        mean, covariance = task.estimator.mean(estimate), task.estimator.covariance(estimate)
         np.testing.assert_allclose(mean, np.where(granted, best.mean[0], silent.mean[0]))
         expected = np.where(granted, best.covariance[0], silent.covariance[0])
         np.testing.assert_allclose(covariance, expected, atol=1e-12)

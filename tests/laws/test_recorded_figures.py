@@ -60,7 +60,7 @@ def figures_of(case: Case, owner: Owner | None) -> Figures:
         for name in signals:
             add(name, step, signals[name])
         if owner is not None:
-            beliefs = batch.memory.beliefs(batch.state)
+            beliefs = batch.beliefs()
             add("difference of beliefs", step, beliefs.difference)
             add("value of a transmission", step, beliefs.value())
         result = batch.step(request)

@@ -8,8 +8,8 @@ import pytest
 from cases import Array, Case, actions, each_case, read, requests
 
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.system import Signals
 from fusion_gym.envs.single import FusionEnv
 
 RUNS, STEPS = 4, 6
@@ -34,9 +34,15 @@ def test_noise_is_the_same_whatever_is_requested(case: Case) -> None:
 
 def hidden(batch: EpisodeBatch) -> list[Array]:
     """What no policy can change."""
-    signals, system = read(batch), batch.task.system
+    signals, plant = read(batch), batch.state.plant
     measured = np.where(signals.get("sampled", True), np.moveaxis(signals["measurement"], 1, 0), 0)
-    result = [batch.noise(), system.truth(batch.state), batch.price, batch.admitted(), measured]
+    result = [
+        batch.normals(),
+        batch.task.plant.truth(plant),
+        batch.price,
+        batch.admitted(),
+        measured,
+    ]
     return [np.copy(part) for part in result]
 
 
@@ -91,7 +97,14 @@ def test_a_branch_takes_the_step_that_would_have_been(case: Case, owner: Any) ->
 
 def contents(runs: Any) -> list[bytes]:
     """All that is shown of runs."""
-    observation = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted(), runs.queue]
+    observation = [
+        runs.observe(),
+        runs.tokens,
+        runs.price,
+        runs.steps,
+        runs.admitted(),
+        runs.state.network.queue,
+    ]
     observation += [runs.beliefs().best.mean, runs.beliefs().value()]
     return [np.ascontiguousarray(part).tobytes() for part in observation]
 
@@ -103,7 +116,7 @@ def contents(runs: Any) -> list[bytes]:
 def test_an_observation_is_finite_within_its_bounds_and_declared(case: Case) -> None:
     """So are signals, with the axes that are declared; also long after the last delivery."""
     batch = case.batch(RUNS)
-    layout, system = ObservationLayout(batch.task), batch.task.system
+    layout, declared_signals = ObservationLayout(batch.task), batch.task.estimator.signals
     assert len(set(layout.names)) == len(layout.names) == len(layout.low)
     assert (layout.low < layout.high).all()
     for step, request in enumerate(requests(batch.task, RUNS, 24)):
@@ -112,8 +125,8 @@ def test_an_observation_is_finite_within_its_bounds_and_declared(case: Case) -> 
         assert observation.shape == (RUNS, len(layout.names))
         assert ((observation >= layout.low) & (observation <= layout.high)).all()
         sizes, signals = {"N": RUNS, "sensors": batch.task.sensors}, read(batch)
-        assert set(signals) == {signal.name for signal in system.signals}
-        for signal in system.signals if step in (0, 20, 21) else ():
+        assert set(signals) == {signal.name for signal in declared_signals}
+        for signal in declared_signals if step in (0, 20, 21) else ():
             axes = [axis for axis in signal.axes.strip("()").replace(" ", "").split(",") if axis]
             value = signals[signal.name]
             assert np.isfinite(value).all(), signal.name
@@ -132,7 +145,7 @@ FORMULAS: dict[str, Callable[[EpisodeBatch, Signals], Array]] = {
     "uncensored_probability": lambda b, s: s["uncensored_probability"],
     "tokens": lambda b, s: b.tokens / b.task.settings["token_capacity"],
     "admitted": lambda b, s: b.admitted(),
-    "queue": lambda b, s: b.queue / b.task.sensors,
+    "queue": lambda b, s: b.state.network.queue / b.task.sensors,
     "time_left": lambda b, s: 1.0 - b.steps / b.task.horizon,
     "price": lambda b, s: place(b.price, *b.task.settings["price_range"]),
 }
@@ -142,7 +155,7 @@ CONSTANT: dict[str, Callable[[EpisodeBatch, Signals], Array]] = {
     "difference": lambda b, s: s["measurement"] - s["held"],
     "error": lambda b, s: s["innovation"],
 }
-DIFFERING = {"whitened_innovation": "MarkovJumpSystem"}  # that of the node, not of the packet
+DIFFERING = {"whitened_innovation": "MarkovJumpEstimator"}  # that of the node, not of the packet
 
 
 def place(price: Array, low: float, high: float) -> Array:
@@ -154,7 +167,7 @@ def place(price: Array, low: float, high: float) -> Array:
 def test_blocks_that_every_system_may_have_mean_the_same(case: Case) -> None:
     batch, result = case.batch(RUNS), 0
     ratios: dict[str, list[Array]] = {}
-    kind = type(batch.task.system).__name__
+    kind = type(batch.task.estimator).__name__
     for request in requests(batch.task, RUNS, STEPS):
         observation, signals, first = batch.observe(), read(batch), 0
         for block in batch.layout.blocks:

@@ -106,7 +106,8 @@ def course(drawn: Drawn, share: float, memory: bool) -> tuple[np.ndarray, ...]:
     for step in range(task.horizon):
         observed = batch.observe()
         batch.step(request(random, step, task.sensors, 5))
-        mean, covariance = task.system.fused(batch.delivered)
+        estimate = batch.delivered.estimate
+        mean, covariance = task.estimator.mean(estimate), task.estimator.covariance(estimate)
         whole = np.append(scale, np.ones(len(mean) - len(scale)))[:, None]
         result.append((observed, mean / whole, covariance / whole[:, None] / whole))
     return tuple(map(np.array, zip(*result, strict=True)))
@@ -185,7 +186,7 @@ def test_no_error_without_transmissions_is_negative(place: float, share: float) 
     plant = MarkovJumpPlant.create(
         [transition] * 2, [np.eye(2)] * 2, noise, [[0.7, 0.3], [0.1, 0.9]], [0.2, 0.8], mean, start
     )
-    sensors = make_task("fusion_gym/MarkovJumpTracking-v1").system.sensors
+    sensors = make_task("fusion_gym/MarkovJumpTracking-v1").plant.sensors
     expected = LinearPlant.create(transition, noise, mean, start).open_loop(50)
     result = AugmentedModel.create(plant, sensors).open_loop(50)
     np.testing.assert_allclose(result, expected, rtol=1e-6 + 1e-30 * place**2)
@@ -203,8 +204,9 @@ def test_a_step_names_run_step_and_quantity(family: str) -> None:
     batch = EpisodeBatch.seeded(task, 3, seed=0)
     nobody = np.zeros((task.sensors, 3), dtype=np.bool_)
     batch.step(nobody)
-    batch.state.truth = batch.state.truth.copy()
-    batch.state.truth[0, 1] = np.nan
+    state = batch.state.plant
+    state.truth = state.truth.copy()
+    state.truth[0, 1] = np.nan
     with pytest.raises(DivergenceError, match="run 1, step 2: the truth"):
         batch.step(nobody)
     batch.finished[1] = True
@@ -215,8 +217,9 @@ def test_a_step_names_an_entry_of_the_observation() -> None:
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2")
     batch = EpisodeBatch.seeded(task, 2, seed=0)
     batch.observe()
-    batch.state.prior_covariance = batch.state.prior_covariance.copy()
-    batch.state.prior_covariance[0, 0, 1] = np.nan
+    estimate = batch.state.estimate
+    estimate.prior_covariance = estimate.prior_covariance.copy()
+    estimate.prior_covariance[0, 0, 1] = np.nan
     with pytest.raises(
         DivergenceError, match=r"run 1, step 0: the observation 'log_variance\[x1\]"
     ):

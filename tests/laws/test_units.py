@@ -173,8 +173,8 @@ each = pytest.mark.parametrize(
 class Channels:
     """The default noise, times orthogonal matrices."""
 
-    def __init__(self, start: Array, step: Array) -> None:
-        self._start, self._step, self._own = start, step, PhiloxNoise()
+    def __init__(self, start: Array, step: Array, stream: int = 0) -> None:
+        self._start, self._step, self._own = start, step, PhiloxNoise(stream)
 
     def start(self, seed: int, episode: int, channels: int) -> Array:
         return self._start @ self._own.start(seed, episode, channels)
@@ -188,18 +188,19 @@ class Channels:
 
 def exchanged(before: Task, after: Task, order: Array) -> Channels:
     """The noise with which sensors in another order measure the same."""
-    system: Any = before.system
-    steps, starts, sources = system.noise_channels, system.start_channels, before.sensors
-    match type(system).__name__:
-        case "CensoredSystem":
-            own = sources * system.centre.sensors.size
-            start, step = [(2 * system.plant.size, own)], [(steps - own, own)]
-        case "CorrelatedTrackingSystem":
+    plant: Any = before.plant
+    steps, starts, sources = plant.noise_channels, plant.start_channels, before.sensors
+    match type(plant).__name__:
+        case "CensoredPlant":
+            own = sources * plant.sensors.size
+            start, step = [(2 * plant.dynamics.size, own)], [(steps - own, own)]
+        case "CorrelatedTrackingPlant":
             start, step = [], [(steps - 2 * sources, 2 * sources)]
-        case "UnknownInputSystem":
-            start, step = [(system.plant.size, 2 * sources)], [(steps - 2 * sources, 2 * sources)]
-        case "RemoteEstimationSystem":
-            start, step = [(0, sources)], [(first, sources) for first in range(0, steps, sources)]
+        case "DrivenPlant":
+            size = plant.dynamics.size
+            start, step = [(size, 2 * sources)], [(steps - 2 * sources, 2 * sources)]
+        case "ScalarSources":
+            start, step = [(0, sources)], [(0, sources)]
         case _:  # fading, then noises
             start, step = [], [(steps - 2 * sources, sources), (steps - sources, sources)]
     result = np.eye(starts), np.eye(steps)
@@ -216,8 +217,8 @@ def exchanged(before: Task, after: Task, order: Array) -> Channels:
 
 def correlation(task: Task) -> Array:
     """The factor of the correlations of a task's noises."""
-    system: Any = task.system
-    factor: Array = system.centre.sensors.noise_correlation[..., 0]
+    plant: Any = task.plant
+    factor: Array = plant.sensors.noise_correlation[..., 0]
     return factor
 
 
@@ -256,6 +257,8 @@ def permuted(task: Task, order: Array) -> Options:
 def errors(task: Task, order: Array, noise: Channels | None = None) -> Array:
     """The reward's error terms (steps, runs) under random requests of the sensors in an order."""
     batch = EpisodeBatch(task, RUNS, noise=noise)
+    if task.network.noise_channels:  # a loss for each sensor
+        batch.network_source = Channels(np.eye(0), np.eye(task.sensors)[order], stream=1)
     batch.seed(np.arange(RUNS), list(range(RUNS)))
     batch.reset()
     request = np.random.default_rng(1).random((STEPS, task.sensors, RUNS)) < 0.4

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.policies.base import (
     LocalRule,
     PerSensor,

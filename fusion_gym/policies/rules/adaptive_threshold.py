@@ -6,7 +6,7 @@ import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.policies.base import LocalRule, PerSensor, Requests, parameter, shape_of
 
 

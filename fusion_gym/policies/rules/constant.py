@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.policies.base import Requests, Rule, shape_of
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
 from fusion_gym.policies.belief_rule import BeliefRule
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fusion_gym import validation
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.policies.base import (
     LocalRule,
     PerSensor,

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from fusion_gym import validation
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.policies.base import Requests, Rule, parameter, shape_of
 
 

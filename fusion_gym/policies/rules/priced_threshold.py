@@ -7,7 +7,7 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.policies.base import (
     PerSensor,
     Requests,
@@ -127,7 +127,11 @@ class PricedThreshold(BeliefRule):
     def log_ratio(self, signals: Signals) -> Array:
         """Return ln r - k ln max{1, s (p/p0)^μ} (sensors, N); a request is at least 0."""
         value, loss = self._scores(signals)
-        numbers, bucket, age = self.numbers, self.task.bucket, np.maximum(signals["age"], 0.0)
+        numbers, bucket, age = (
+            self.numbers,
+            self.task.network.bucket,
+            np.maximum(signals["age"], 0.0),
+        )
         price = signals["price"] if self.price is None else np.asarray(self.price)
         tokens = (signals["tokens"] + 1.0) / (bucket.capacity + 1.0)
         price = price / self.reference_price

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, parameter, shape_of
 from fusion_gym.policies.chance import Chance
 

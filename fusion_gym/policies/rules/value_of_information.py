@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from fusion_gym import validation
-from fusion_gym.core.system import Signals
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.errors import forbidden
 from fusion_gym.policies.base import Requests, check_at_most, check_price, parameter, strongest
 from fusion_gym.policies.belief_rule import BeliefRule

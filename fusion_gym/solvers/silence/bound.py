@@ -121,7 +121,7 @@ def cost_bound(
         ConfigurationError: a task without this bound, or a value that is not allowed.
     """
     model = silence_model(task, task.error_scale * task.relative_weights[:, 0])
-    packet = validation.number("price", price, above=0.0) * float(task.bucket.cost.min())
+    packet = validation.number("price", price, above=0.0) * float(task.network.bucket.cost.min())
     problem = replace(model.problem, price=packet)
     rough = solve_silence(problem, _ROUGH_STEP * np.sqrt(packet))
     rate = simulate(problem, rough, _ROUGH_EPISODES).packets / task.sensors

@@ -1,7 +1,6 @@
 """The relaxed problem of a task, without censoring and token limits, and its conditions."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +10,12 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.errors import forbidden
 from fusion_gym.solvers.silence.problem import SilenceProblem
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
 from fusion_gym.systems.tobit.centre import Centre, NodeCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter
-from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
 from fusion_gym.validation import ConfigurationError
 
 
@@ -41,13 +42,12 @@ def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
         ConfigurationError: a task whose centre does not predict with the plant's matrix in silence,
             or weights that are not all above 0.
     """
-    system = _system(task)
-    plant, sensors = system.plant, system.centre.sensors
-    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
-    size = plant.size
+    dynamics, sensors = _parts(task)
+    transition, process = dynamics.transition[..., 0], dynamics.process_covariance[..., 0]
+    size = dynamics.size
     weight = validation.positive("weights", np.ones(size) if weights is None else weights, (size,))
     matrix, sensed = sensors.stacked_matrix[..., 0], sensors.noise_covariance[..., 0]
-    covariance, correction = _update(plant.initial_covariance[..., 0], matrix, sensed)
+    covariance, correction = _update(dynamics.initial_covariance[..., 0], matrix, sensed)
     # The centre starts without the first measurement, but a policy may know it.
     before = transition @ correction @ transition.T
     noise, floor = np.empty((task.horizon, size, size)), 0.0
@@ -69,25 +69,26 @@ def _update(prior: Array, matrix: Array, noise: Array) -> tuple[Array, Array]:
     return 0.5 * (posterior + posterior.T), 0.5 * (correction + correction.T)
 
 
-def _system(task: Task) -> CensoredSystem:
-    """Return the task's system, if the bound applies to it."""
-    system: Any = task.system
-    if not isinstance(system, CensoredSystem):
+def _parts(task: Task) -> tuple[LinearPlant, CensoredSensors]:
+    """Return the task's plant and sensors, if the bound applies to them."""
+    plant, estimator = task.plant, task.estimator
+    if not isinstance(plant, CensoredPlant) or not isinstance(estimator, CensoredEstimator):
         raise ConfigurationError(
-            f"system = {type(system).__name__} is not allowed for the bound: it must estimate a "
-            "linear plant from all measurements, as TobitOscillator and the biased systems do"
+            f"plant = {type(plant).__name__} is not allowed for the bound: the centre must "
+            "estimate a linear plant from all measurements, as in TobitOscillator and the biased "
+            "systems"
         )
-    if system.model is not system.plant:
+    if estimator.model is not plant.dynamics:
         reason = "the filters must predict with the plant's own matrix"
         raise forbidden("bias_aware", False, reason, "for the bound")
-    system.nature.refuse("for the bound")
-    if not _predicts(system.centre):
+    plant.nature.refuse("for the bound")
+    if not _predicts(estimator.centre):
         raise ConfigurationError(
             "filter is not allowed for the bound: in silence the centre must predict, so neither "
             "hold the last value (filter='paper' with silent='hold') nor use the information of "
             "silence (filter='stochastic')"
         )
-    return system
+    return plant.dynamics, plant.sensors
 
 
 def _predicts(centre: Centre) -> bool:

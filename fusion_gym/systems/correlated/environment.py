@@ -21,7 +21,11 @@ from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
-from fusion_gym.systems.correlated.system import CorrelatedTrackingSystem
+from fusion_gym.systems.correlated.system import (
+    RANDOM_SCALE,
+    CorrelatedTrackingEstimator,
+    CorrelatedTrackingPlant,
+)
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 
 _T = 0.01  # the paper's sampling time
@@ -51,7 +55,7 @@ class CorrelatedTrackingOptions(PaperOptions):
         >>> from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
         >>> options = CorrelatedTrackingOptions(noise_scale=0.5, horizon=50)
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.horizon, task.bucket.unlimited
+        >>> task.sensors, task.horizon, task.network.bucket.unlimited
         (3, 50, True)
     """
 
@@ -88,7 +92,7 @@ class CorrelatedTrackingOptions(PaperOptions):
     """Order of arrival under the sequential rules: a permutation of the sensors."""
     track_actual: bool = False
     """Whether the system tracks the actual covariances of equations (23), (28), (43) and (55), for
-    ``task.system.actual_covariance(state)``."""
+    ``task.estimator.actual_covariance(state)``."""
     trigger_threshold: ArrayLike = 0.6
     """a of the policy ``adaptive_innovation``, equations (9)-(11): one number, or one per
     sensor."""
@@ -116,20 +120,21 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     plant.warn_of_unseen_growth(sensors.measurement_matrix, _state_names(plant.size))
     if options.track_actual:
         nature.refuse("with track_actual=True")
-    system = CorrelatedTrackingSystem(
-        plant=plant,
+    names, scale = _state_names(plant.size), _noise_scale(options.noise_scale)
+    truth = CorrelatedTrackingPlant(plant, sensors, scale, names, nature)
+    estimator = CorrelatedTrackingEstimator(
+        model=plant,
         filter=RobustKalmanFilter(sensors),
         fusion=choose_rule(options.fusion, _STRUCTURE, sensors.count, options.order, chosen),
-        noise_scale=_noise_scale(options.noise_scale),
-        state_names=_state_names(plant.size),
+        state_names=names,
         state_weights=weights,
         magnitude=typical_magnitude(plant, horizon, random_start=False),
         reference=open_loop,
+        noise_scale=float(np.mean(RANDOM_SCALE)) if scale is None else scale,
         joint=JointErrorCovariance.create(plant, sensors) if options.track_actual else None,
-        nature=nature,
     )
     trigger = _trigger(options, sensors.count)
-    return Scenario(options, system, weights, {"adaptive_innovation": trigger})
+    return Scenario(options, truth, estimator, weights, {"adaptive_innovation": trigger})
 
 
 def _plant_and_sensors(options: CorrelatedTrackingOptions) -> tuple[LinearPlant, CorrelatedSensors]:

@@ -106,7 +106,7 @@ class RobustKalmanFilter:
 
 @dataclass(frozen=True)
 class JointErrorCovariance:
-    """Actual joint covariance of the errors of all estimates.
+    """Bound of the joint covariance of the errors of all estimates.
 
     Estimate 0 is the fused one, estimates 1..l are the nodes'. The joint covariance is an array
     (l + 1, l + 1, n, n, N) of blocks. It is exact for every pattern of deliveries that does not
@@ -116,8 +116,7 @@ class JointErrorCovariance:
     Shapes: ``transition`` (n, n, 1), ``process_covariance`` (n, n, 1), ``initial_covariance``
     (n, n, 1); ``measurement_matrix`` (l + 1, m, n, 1), ``cross_covariance`` (l + 1, n, m, 1) and
     ``covariance`` (l + 1, l + 1, m, m, 1) as in :class:`CorrelatedSensors`, with zeros for the
-    fused estimate, which measures nothing. All are bounds; ``scale`` (N,) turns them into actual
-    values.
+    fused estimate, which measures nothing. All are bounds; actual values are proportional.
 
     Source: adaptive_innovation, equations (16), (17), (23), (28), (43), (55).
     """
@@ -142,28 +141,27 @@ class JointErrorCovariance:
             covariance=np.pad(sensors.covariance, [(1, 0), *ahead]),
         )
 
-    def start(self, scale: Array) -> Array:
+    def start(self, runs: int) -> Array:
         """Return the joint covariance (l+1, l+1, n, n, N) of time 0: all estimates are equal."""
-        count = len(self.measurement_matrix)
-        actual = scale * self.initial_covariance
-        return np.broadcast_to(actual, (count, count, *actual.shape)).copy()
+        count, size = len(self.measurement_matrix), len(self.transition)
+        return np.broadcast_to(self.initial_covariance, (count, count, size, size, runs)).copy()
 
-    def predict(self, joint: Array, scale: Array) -> Array:
-        """Return Φ J Φᵀ + scale · Q in every block."""
+    def predict(self, joint: Array) -> Array:
+        """Return Φ J Φᵀ + Q in every block."""
         moved = linalg.matmul(self.transition, joint)
         moved = linalg.matmul(moved, linalg.transpose(self.transition))
-        return moved + scale * self.process_covariance
+        return moved + self.process_covariance
 
-    def update(self, joint: Array, gain: Array, granted: NDArray[np.bool_], scale: Array) -> Array:
+    def update(self, joint: Array, gain: Array, granted: NDArray[np.bool_]) -> Array:
         """Return the joint covariance after granted (l, N) nodes update with gains (l, n, m, N)."""
         used = np.zeros((len(joint), *gain.shape[1:]))
         used[1:] = np.where(granted[:, None, None], gain, 0.0)
         retention = linalg.identity(joint.shape[-2]) - linalg.matmul(used, self.measurement_matrix)
         result = linalg.matmul(retention[:, None], joint)
         result = linalg.matmul(result, linalg.transpose(retention)[None])
-        crossed = linalg.matmul(retention[:, None], (scale * self.cross_covariance)[None])
+        crossed = linalg.matmul(retention[:, None], self.cross_covariance[None])
         crossed = linalg.matmul(crossed, linalg.transpose(used)[None])
-        noise = linalg.matmul(used[:, None], scale * self.covariance)
+        noise = linalg.matmul(used[:, None], self.covariance)
         noise = linalg.matmul(noise, linalg.transpose(used)[None])
         return _symmetric(result - crossed - _transposed(crossed) + noise)
 

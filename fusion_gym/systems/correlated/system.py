@@ -6,7 +6,6 @@ based on adaptive innovation event-triggered mechanism for uncertain networked s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,23 +15,24 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.system import (
+from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.knowledge import (
     Block,
-    SignalArray,
-    System,
     age_block,
     common_signals,
     log_deviation,
     numbered,
     sensed,
 )
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.plant import Plant
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
     JointErrorCovariance,
     RobustKalmanFilter,
     RobustOutcomes,
 )
+from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
 from fusion_gym.validation import refusal
 
@@ -41,20 +41,110 @@ RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
 
 
 @dataclass(slots=True)
-class CorrelatedTrackingState:
-    """The state of N runs at one time; n states, l sensors, m components.
+class CorrelatedTrackingTruth:
+    """The true state of N runs at one time; n states, l sensors, m channels.
 
-    Estimate 0 is the fused one and estimate i is node i's. ``truth`` (n, N) · ``scale`` (N,),
-    actual variances over their bounds · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last
-    delivered measurement · ``age`` (l, N), steps since then · ``prior_mean`` (l + 1, n, N),
-    ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``outcomes`` at
-    the nodes · ``mean`` (l + 1, n, N), ``covariance`` (l + 1, n, n, N), posteriors · ``joint``
-    (l + 1, l + 1, n, n, N), the actual covariances, if tracked · ``departure`` (4, N) of the truth
-    from the model, if any.
+    ``truth`` (n, N) · ``scale`` (N,), actual variances over their bounds · ``measurement``
+    (l, m, N) · ``departure`` (4, N) of the truth from the model, if any.
     """
 
     truth: Array
     scale: Array
+    measurement: Array
+    departure: Array | None = None
+
+
+@dataclass(frozen=True)
+class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
+    """A linear plant with sensors that share its noise.
+
+    ``dynamics.process_factor`` is Γ Q^½, so that plant and sensors use the same normals.
+    ``noise_scale`` is the ratio of actual variances to bounds; ``None`` draws it for each episode
+    from ``RANDOM_SCALE``. ``nature`` is the departure of the truth from this model.
+    """
+
+    dynamics: LinearPlant
+    sensors: CorrelatedSensors
+    noise_scale: float | None
+    state_names: tuple[str, ...]
+    nature: Nature = AS_ASSUMED
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.sensors.count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: process noise, then the sensors'."""
+        return self.dynamics.noise_channels + self.sensors.noise_channels
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: the state's deviation, the noise scale, nature's."""
+        return self.dynamics.initial_factor.shape[1] + 1 + self.nature.channels
+
+    def start(self, noise: Array) -> tuple[CorrelatedTrackingTruth, None]:
+        """Draw the initial state; nothing has been measured."""
+        noise, departure = self.nature.begin(noise)
+        scale = self._scale(noise[-1])
+        truth = self.dynamics.start(self.dynamics.initial_mean, np.sqrt(scale) * noise[:-1])
+        nothing = np.full((self.sensors.count, self.sensors.size, noise.shape[-1]), np.nan)
+        return CorrelatedTrackingTruth(truth, scale, nothing, departure), None
+
+    def sense(self, state: CorrelatedTrackingTruth, noise: Array) -> CorrelatedTrackingTruth:
+        """Move the plant, and measure with the same noise.
+
+        Source: adaptive_innovation, equations (1)-(3).
+        """
+        actual, r = np.sqrt(state.scale) * noise, self.dynamics.noise_channels
+        process, own = true_noise(state.departure, actual[:r], actual[r:])
+        truth = self.dynamics.advance(state.truth, process, state.departure)
+        return replace(state, truth=truth, measurement=self.sensors.measure(truth, process, own))
+
+    @property
+    def draw_channels(self) -> int:
+        """Number of states, and one for the noise scale."""
+        return self.dynamics.size + 1
+
+    def draw(
+        self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
+    ) -> CorrelatedTrackingTruth:
+        """Draw the noise scale from its law, and the truth from that share of the covariance."""
+        scale = self._scale(noise[-1])
+        truth = linalg.draw_normal(mean, scale * covariance, noise[:-1])
+        return CorrelatedTrackingTruth(truth, scale, measurement)
+
+    def open_loop(self, horizon: int) -> Array:
+        """Return the bound of the mean error variance (n,) of predictions over t = 1..horizon."""
+        return self.dynamics.open_loop(horizon)
+
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """See :class:`Plant`."""
+        matrix, deviation = self.sensors.measurement_matrix, self.sensors.deviation
+        moments = self.dynamics.second_moments(horizon)
+        return largest_ratio(moments, matrix[..., 0] / deviation), 0.0
+
+    def _scale(self, noise: Array) -> Array:
+        """Return noise scales (N,) from standard normals (N,)."""
+        if self.noise_scale is not None:
+            return np.full(noise.shape, self.noise_scale)
+        low, high = RANDOM_SCALE
+        return low + (high - low) * ndtr(noise)
+
+
+@dataclass(slots=True)
+class CorrelatedTrackingEstimate:
+    """The estimates of N runs at one time; n states, l sensors, m channels.
+
+    Estimate 0 is the fused one and estimate i is node i's. ``measurement`` (l, m, N) · ``held``
+    (l, m, N), the last delivered measurement · ``age`` (l, N), steps since then · ``prior_mean``
+    (l + 1, n, N), ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and
+    ``outcomes`` at the nodes · ``means`` (l + 1, n, N), ``covariances`` (l + 1, n, n, N),
+    posteriors · ``joint`` (l + 1, l + 1, n, n, N), the bound of the errors' covariances, if
+    tracked.
+    """
+
     measurement: Array
     held: Array
     age: Array
@@ -62,59 +152,39 @@ class CorrelatedTrackingState:
     prior_covariance: Array
     expected: Array
     outcomes: RobustOutcomes | None
-    mean: Array
-    covariance: Array
+    means: Array
+    covariances: Array
     joint: Array | None
-    departure: Array | None = None
 
 
 SIGNALS = common_signals(prior_covariance="conservative covariance of the prediction")
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
-    """A plant, sensors that share its noise, robust local filters, and a fusion rule.
+class CorrelatedTrackingEstimator(Estimator[CorrelatedTrackingEstimate]):
+    """Robust local filters, and a fusion rule without feedback.
 
-    ``plant.process_factor`` is Γ Q^½, so that plant and sensors use the same normals.
-    ``noise_scale`` is the ratio of actual variances to bounds; ``None`` draws it for each episode
-    from ``RANDOM_SCALE``. ``state_weights`` (n,) weigh the traces among the signals, ``magnitude``
-    (n,) divides observed estimates and ``reference`` (n,) observed variances. ``joint`` tracks the
-    actual covariances. ``nature`` is the departure of the truth from this model.
+    ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
+    estimates and ``reference`` (n,) observed variances. ``joint`` tracks the covariances of the
+    errors, of which the actual ones are the share ``noise_scale`` in the mean.
     """
 
-    plant: LinearPlant
+    model: LinearPlant
     filter: RobustKalmanFilter
     fusion: FusionRule
-    noise_scale: float | None
     state_names: tuple[str, ...]
     state_weights: Array
     magnitude: Array
     reference: Array
+    noise_scale: float
     joint: JointErrorCovariance | None = None
-    nature: Nature = AS_ASSUMED
     signals = SIGNALS
     covariance_cycle = 1  # the recursion of the covariances does not depend on time
-    extensions = ("actual_covariance",)
-
-    @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.filter.sensors.count
-
-    @property
-    def noise_channels(self) -> int:
-        """Normals of one step: process noise, then the sensors'."""
-        return self.plant.noise_channels + self.filter.sensors.noise_channels
-
-    @property
-    def start_channels(self) -> int:
-        """Normals of a start: the state's deviation, the noise scale, nature's."""
-        return self.plant.initial_factor.shape[1] + 1 + self.nature.channels
 
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes, states = numbered(self.sensor_count), self.state_names
+        nodes, states = numbered(self.filter.sensors.count), self.state_names
         block = partial(Block, limit=_RANGE)
         components = (nodes, numbered(self.filter.sensors.size))
         innovation = "innovation of the node over its predicted deviation"
@@ -154,18 +224,13 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             ),
         )
 
-    def start(self, noise: Array) -> CorrelatedTrackingState:
-        """Draw the initial state; nothing has been measured."""
-        runs, nodes, n = noise.shape[-1], self.sensor_count, self.plant.size
-        noise, departure = self.nature.begin(noise)
-        scale = self._scale(noise[-1])
-        plant = self.plant
-        mean = np.broadcast_to(plant.initial_mean, (nodes + 1, n, runs)).copy()
-        covariance = np.broadcast_to(plant.initial_covariance, (nodes + 1, n, n, runs)).copy()
+    def start(self, measurement: Array, announcement: None) -> CorrelatedTrackingEstimate:
+        """Return equal estimates; nothing has been measured."""
+        nodes, n, runs = self.filter.sensors.count, self.model.size, measurement.shape[-1]
+        mean = np.broadcast_to(self.model.initial_mean, (nodes + 1, n, runs)).copy()
+        covariance = np.broadcast_to(self.model.initial_covariance, (nodes + 1, n, n, runs)).copy()
         expected = self.filter.expect(mean[1:])
-        return CorrelatedTrackingState(
-            truth=plant.start(mean[0], np.sqrt(scale) * noise[:-1]),
-            scale=scale,
+        return CorrelatedTrackingEstimate(
             measurement=expected,
             held=expected,
             age=np.zeros((nodes, runs)),
@@ -173,28 +238,22 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             prior_covariance=covariance,
             expected=expected,
             outcomes=None,
-            mean=mean,
-            covariance=covariance,
-            joint=None if self.joint is None else self.joint.start(scale),
-            departure=departure,
+            means=mean,
+            covariances=covariance,
+            joint=None if self.joint is None else self.joint.start(runs),
         )
 
-    def sense(self, state: CorrelatedTrackingState, noise: Array) -> CorrelatedTrackingState:
-        """Move the plant, measure with the same noise, and predict all estimates.
+    def predict(self, state: CorrelatedTrackingEstimate) -> CorrelatedTrackingEstimate:
+        """Predict all estimates.
 
-        Source: adaptive_innovation, equations (1)-(3), (12), (40), (52).
+        Source: adaptive_innovation, equations (12), (40), (52).
         """
-        actual, r = np.sqrt(state.scale) * noise, self.plant.noise_channels
-        process, own = true_noise(state.departure, actual[:r], actual[r:])
-        truth = self.plant.advance(state.truth, process, state.departure)
-        prior_mean, prior_covariance = self.plant.predict(state.mean, state.covariance)
+        prior_mean, prior_covariance = self.model.predict(state.means, state.covariances)
         joint = state.joint
         if self.joint is not None and joint is not None:
-            joint = self.joint.predict(joint, state.scale)
+            joint = self.joint.predict(joint)
         return replace(
             state,
-            truth=truth,
-            measurement=self.filter.sensors.measure(truth, process, own),
             age=state.age + 1.0,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
@@ -203,37 +262,41 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             joint=joint,
         )
 
-    def deliver(
-        self, state: CorrelatedTrackingState, granted: NDArray[np.bool_]
-    ) -> CorrelatedTrackingState:
-        """Update the granted nodes, and fuse the centre's prediction with their estimates.
+    def observe(
+        self, state: CorrelatedTrackingEstimate, measurement: Array
+    ) -> CorrelatedTrackingEstimate:
+        """Take the measurement."""
+        return replace(state, measurement=measurement)
+
+    def update(
+        self, state: CorrelatedTrackingEstimate, reception: Reception
+    ) -> CorrelatedTrackingEstimate:
+        """Update the nodes, and fuse the centre's prediction with their estimates.
 
         Source: adaptive_innovation, equations (12), (37)-(41) or (47)-(53).
         """
-        outcomes = sensed(state.outcomes)
-        grant = granted[:, None]
+        outcomes, arrived = sensed(state.outcomes), reception.arrived
+        grant = arrived[:, None]
         mean, covariance = state.prior_mean.copy(), state.prior_covariance.copy()
         correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
         mean[1:] += np.where(grant, correction, 0.0)
         np.copyto(covariance[1:], outcomes.delivered_covariance, where=grant[:, None])
-        fused = self.fusion.fuse(mean, covariance, _with_prediction(granted))
+        fused = self.fusion.fuse(mean, covariance, _with_prediction(arrived))
         mean[0], covariance[0] = fused.mean, fused.covariance
         joint = state.joint
         if self.joint is not None and joint is not None:
-            joint = self.joint.update(joint, outcomes.gain, granted, state.scale)
+            joint = self.joint.update(joint, outcomes.gain, arrived)
             joint = self.joint.fuse(joint, fused.gains)
         return replace(
             state,
             held=np.where(grant, state.measurement, state.held),
-            age=np.where(granted, 0.0, state.age),
-            mean=mean,
-            covariance=covariance,
+            age=np.where(arrived, 0.0, state.age),
+            means=mean,
+            covariances=covariance,
             joint=joint,
         )
 
-    def read(
-        self, state: CorrelatedTrackingState
-    ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+    def read(self, state: CorrelatedTrackingEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
         outcomes = sensed(state.outcomes)
         return {
@@ -251,109 +314,70 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             "variance_reduction": lambda: self._variance_reduction(state, outcomes),
         }
 
-    def visible(self, state: CorrelatedTrackingState) -> CorrelatedTrackingState:
-        """Return the state without truth, noise scale, actual covariances and departure."""
-        hidden = np.full_like(state.truth, np.nan)
-        return replace(state, truth=hidden, scale=hidden[0], joint=None, departure=None)
-
-    @property
-    def imagination_channels(self) -> int:
-        """Number of states, and one for the noise scale."""
-        return self.plant.size + 1
-
-    def imagine(
-        self, state: CorrelatedTrackingState, mean: Array, covariance: Array, noise: Array
-    ) -> CorrelatedTrackingState:
-        """Draw the noise scale from its law, and the truth from that share of the covariance."""
-        scale = self._scale(noise[-1])
-        truth = linalg.draw_normal(mean, scale * covariance, noise[:-1])
-        return replace(state, truth=truth, scale=scale, departure=None)
-
     def adopt(
         self,
-        state: CorrelatedTrackingState,
+        state: CorrelatedTrackingEstimate,
         mean: Array,
         covariance: Array,
         runs: NDArray[np.bool_],
-    ) -> CorrelatedTrackingState:
+    ) -> CorrelatedTrackingEstimate:
         """Replace the fused estimate in ``runs`` (N,), not the nodes'."""
-        means, covariances = state.mean.copy(), state.covariance.copy()
+        means, covariances = state.means.copy(), state.covariances.copy()
         means[0] = np.where(runs, mean, means[0])
         covariances[0] = np.where(runs, covariance, covariances[0])
-        return replace(state, mean=means, covariance=covariances)
+        return replace(state, means=means, covariances=covariances)
 
-    def fused(self, state: CorrelatedTrackingState) -> tuple[Array, Array]:
-        """Return the centre's mean (n, N) and conservative covariance (n, n, N)."""
-        return state.mean[0], state.covariance[0]
+    def mean(self, state: CorrelatedTrackingEstimate) -> Array:
+        """Return the centre's mean (n, N)."""
+        return state.means[0]
 
-    def local_means(self, state: CorrelatedTrackingState) -> Array:
+    def covariance(self, state: CorrelatedTrackingEstimate) -> Array:
+        """Return the centre's conservative covariance (n, n, N)."""
+        return state.covariances[0]
+
+    def local_means(self, state: CorrelatedTrackingEstimate) -> Array:
         """Return the nodes' posterior means (sensors, n, N)."""
-        return state.mean[1:]
+        return state.means[1:]
 
-    def actual_covariance(self, state: CorrelatedTrackingState) -> Array:
+    def with_actual_covariance(self) -> CorrelatedTrackingEstimator:
+        """Return the same estimator with tracked covariances of the errors."""
+        return replace(self, joint=JointErrorCovariance.create(self.model, self.filter.sensors))
+
+    def actual_covariance(self, state: CorrelatedTrackingEstimate) -> Array:
         """Return the actual covariances (l + 1, l + 1, n, n, N); estimate 0 is the fused one.
 
+        Gains and fusion weights come from the bounds, so they are proportional to the noise scale.
+        Where it is drawn they are the mean over its draws.
+
         Args:
-            state: a state after :meth:`deliver`.
+            state: a state after :meth:`update`.
 
         Raises:
-            ConfigurationError: the system does not track them.
+            ConfigurationError: the estimator does not track them.
         """
         if state.joint is None:
             raise refusal("track_actual", False, "True for actual covariances", "here")
-        return state.joint
+        return self.noise_scale * state.joint
 
-    def with_actual_covariance(self) -> CorrelatedTrackingSystem:
-        """Return the same system with tracked actual covariances."""
-        joint = JointErrorCovariance.create(self.plant, self.filter.sensors)
-        return replace(self, joint=joint)
-
-    def error_covariance(self, state: CorrelatedTrackingState) -> Array:
-        """Return the actual covariance (n, n, N) of the fused error.
-
-        Gains and fusion weights come from the bounds, so it is proportional to the noise scale. A
-        start with zeros has the mean scale, and therefore the mean over drawn scales.
-
-        Args:
-            state: a state after :meth:`deliver`.
-
-        Raises:
-            ConfigurationError: the system does not track it.
-        """
+    def error_covariance(self, state: CorrelatedTrackingEstimate) -> Array:
+        """Return the actual covariance (n, n, N) of the fused error."""
         return self.actual_covariance(state)[0, 0]
 
-    def open_loop(self, horizon: int) -> Array:
-        """Return the bound of the mean error variance (n,) of predictions over t = 1..horizon."""
-        return self.plant.open_loop(horizon)
-
-    def rounding(self, horizon: int) -> tuple[float, float]:
-        """See :class:`System`."""
-        matrix, deviation = self.filter.sensors.measurement_matrix, self.filter.sensors.deviation
-        moments = self.plant.second_moments(horizon)
-        return largest_ratio(moments, matrix[..., 0] / deviation), 0.0
-
-    def _scale(self, noise: Array) -> Array:
-        """Return noise scales (N,) from standard normals (N,)."""
-        if self.noise_scale is not None:
-            return np.full(noise.shape, self.noise_scale)
-        low, high = RANDOM_SCALE
-        return low + (high - low) * ndtr(noise)
-
-    def _whitened(self, state: CorrelatedTrackingState) -> Array:
+    def _whitened(self, state: CorrelatedTrackingEstimate) -> Array:
         deviation = _deviation(sensed(state.outcomes).innovation_covariance)
         return (state.measurement - state.expected) / deviation
 
-    def _fused_innovation(self, state: CorrelatedTrackingState) -> Array:
+    def _fused_innovation(self, state: CorrelatedTrackingEstimate) -> Array:
         deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))
         return (state.measurement - self.filter.expect(state.prior_mean[0])) / deviation
 
     def _variance_reduction(
-        self, state: CorrelatedTrackingState, outcomes: RobustOutcomes
+        self, state: CorrelatedTrackingEstimate, outcomes: RobustOutcomes
     ) -> Array:
         covariance = np.concatenate((state.prior_covariance[:1], outcomes.delivered_covariance))
         silent = linalg.weighted_trace(covariance[0], self.state_weights)
-        result = np.empty((self.sensor_count, len(silent)))
-        for sensor in range(self.sensor_count):
+        result = np.empty((self.filter.sensors.count, len(silent)))
+        for sensor in range(self.filter.sensors.count):
             single = np.zeros(result.shape, dtype=np.bool_)
             single[sensor] = True
             fused = self.fusion.fuse(state.prior_mean, covariance, _with_prediction(single))

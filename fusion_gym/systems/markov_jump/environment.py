@@ -16,15 +16,17 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
+from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
+from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralEstimator
 from fusion_gym.systems.markov_jump.centralised_linear import CentralisedLinearFilter
+from fusion_gym.systems.markov_jump.fading_plant import FadingPlant
 from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
-from fusion_gym.systems.markov_jump.linear_minimum_variance import LocalFilters
+from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
+from fusion_gym.systems.markov_jump.system import MarkovJumpEstimator
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
@@ -66,7 +68,7 @@ class MarkovJumpTrackingOptions(PaperOptions):
         >>> from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
         >>> options = MarkovJumpTrackingOptions(filter="imm", sampling_periods=(1, 1, 2))
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.system.state_names
+        >>> task.sensors, task.plant.state_names
         (3, ('position', 'velocity'))
     """
 
@@ -117,7 +119,7 @@ class MarkovJumpTrackingOptions(PaperOptions):
 def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
     """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
-    plant = MarkovJumpPlant.create(
+    dynamics = MarkovJumpPlant.create(
         options.transitions,
         options.process_gains,
         options.process_covariance,
@@ -133,52 +135,46 @@ def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
         options.fading_probabilities,
         options.noise_coupling,
         options.measurement_variance,
-        plant,
+        dynamics,
     )
-    weights = (
-        None
-        if options.state_weights is None
-        else validation.not_negative("state_weights", options.state_weights, (plant.size,))
-    )
-    nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
-    nature.check_growth(plant.true_radius, horizon)
-    system = _system(options.filter, options.fusion, plant, sensors, weights, horizon, nature)
-    memory_system = None
+    weights = options.state_weights
+    if weights is not None:
+        weights = validation.not_negative("state_weights", weights, (dynamics.size,))
+    nature = Nature.create(options, (*dynamics.unmoved, "true_threshold_shift"))
+    nature.check_growth(dynamics.true_radius, horizon)
+    model = AugmentedModel.create(dynamics, sensors)
+    plant = FadingPlant(dynamics, sensors, model, _state_names(dynamics.size), nature)
+    estimator = _estimator(options.filter, options.fusion, plant, weights, horizon)
+    memory = None
     if (kind := options.memory_filter) is not None:
         fusion = options.fusion if kind == options.filter else None
-        memory_system = _system(kind, fusion, plant, sensors, weights, horizon, nature)
+        memory = _estimator(kind, fusion, plant, weights, horizon)
     defaults, refusal = {}, None
-    if isinstance(system, MarkovJumpSystem):
-        defaults = {"local_variance": {"reference": float(system.full_rate_traces().mean())}}
+    if isinstance(estimator, MarkovJumpEstimator):
+        defaults = {"local_variance": {"reference": float(estimator.full_rate_traces().mean())}}
         refusal = _ESTIMATES_ALREADY
     return Scenario(
         options,
-        system,
-        system.state_weights,
+        plant,
+        estimator,
+        estimator.state_weights,
         defaults,
-        memory_system=memory_system,
+        memory_estimator=memory,
         nodes_have_memory=refusal is not None,
         no_estimates=refusal,
     )
 
 
-def _system(
-    where: str,
-    kind: str | None,
-    plant: MarkovJumpPlant,
-    sensors: FadingSensors,
-    weights: Array | None,
-    horizon: int,
-    nature: Nature,
-) -> MarkovJumpSystem | MarkovJumpCentralSystem:
-    """Return the system of a filter and a fusion rule."""
-    names = _state_names(plant.size)
-    fusion = _fusion(kind, where, sensors.count, weights)
+def _estimator(
+    where: str, kind: str | None, plant: FadingPlant, weights: Array | None, horizon: int
+) -> MarkovJumpEstimator | MarkovJumpCentralEstimator:
+    """Return the estimator of a filter and a fusion rule."""
+    model, names = plant.model, plant.state_names
+    fusion = _fusion(kind, where, plant.sensor_count, weights)
+    weights = equal_weights(model.open_loop(horizon)) if weights is None else weights
     if fusion is None:
-        return MarkovJumpCentralSystem.create(
-            plant, sensors, where == "imm", names, weights, horizon, nature
-        )
-    return MarkovJumpSystem.create(plant, sensors, fusion, names, weights, horizon, nature)
+        return MarkovJumpCentralEstimator.create(model, where == "imm", names, weights, horizon)
+    return MarkovJumpEstimator.create(model, fusion, names, weights, horizon)
 
 
 def _fusion(kind: str | None, where: str, sensors: int, weights: Array | None) -> FusionRule | None:

@@ -1,4 +1,4 @@
-"""Markov jump plant, nodes with filters, a link from node to centre, fusion of the centre's copies.
+"""Nodes with filters, a link from node to centre, fusion of the centre's copies.
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements).
@@ -6,7 +6,6 @@ systems with correlated noises and fading measurements).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,34 +14,109 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import AS_ASSUMED, Nature
-from fusion_gym.core.system import Block, SignalArray, age_block, log_deviation, numbered, sensed
-from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
-from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagRecursion
-from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
-from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
-from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.systems.markov_jump.state import (
-    SIGNALS,
-    MarkovJumpFamily,
-    MarkovJumpState,
-    sampling_blocks,
+from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.knowledge import (
+    Block,
+    Signal,
+    age_block,
+    common_signals,
+    log_deviation,
+    numbered,
+    sensed,
 )
+from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
+from fusion_gym.systems.markov_jump.lag_errors import (
+    JointPrediction,
+    LagCovariances,
+    LagRecursion,
+)
+from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    AugmentedModel,
+    LocalFilters,
+    Times,
+)
+from fusion_gym.systems.markov_jump.sensors import FadingSensors
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero right after a packet
 
 
+@dataclass(slots=True)
+class MarkovJumpEstimate:
+    """The estimates of N runs at one time k; n states, a = modes · n, r noises, l sensors.
+
+    ``time`` k (N,) · ``measurement`` (l, 1, N), NaN, and ``innovation`` ε (l, N), zero, where a
+    sensor does not sample · ``node_mean`` ζ̂(k|k) (l, a, N), ``node_noise`` ŵ (l, r, N), the nodes'
+    · ``copy_mean`` (l, a, N), ``copy_noise`` (l, r, N), the centre's: a prediction until delivery ·
+    ``held`` (l, n, N), the last delivered estimates · ``age`` (l, N), steps since then · ``sent``
+    (l, N) bool, the last deliveries · ``lags`` and ``prediction``, covariances · ``prior_mean``
+    (n, N), ``prior_covariance`` (n, n, N), fused without a transmission · ``mean`` (n, N),
+    ``covariance`` (n, n, N), fused after the delivery.
+    """
+
+    time: Times
+    measurement: Array
+    innovation: Array
+    node_mean: Array
+    node_noise: Array
+    copy_mean: Array
+    copy_noise: Array
+    held: Array
+    age: Array
+    sent: NDArray[np.bool_]
+    lags: LagCovariances
+    prediction: JointPrediction | None
+    prior_mean: Array
+    prior_covariance: Array
+    mean: Array
+    covariance: Array
+
+
+_PER_SENSOR = "(sensors, N)"
+# What both estimators of the family offer beside the common signals.
+OF_FAMILY = (
+    Signal("centre_variance", "centre", "(N,)", "plain trace of the covariance without a delivery"),
+    Signal(
+        "greedy_variance",
+        "centre",
+        _PER_SENSOR,
+        "trace if only the sensors before this one in the greedy order transmit",
+    ),
+    Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step", "own"),
+)
+SIGNALS = (
+    *common_signals(
+        "(sensors, n, N)",
+        measurement="the node's new estimate",
+        innovation="the node's new estimate minus the centre's copy",
+        held="the last delivered estimate",
+        expected_measurement="the centre's copy, predicted",
+    ),
+    *OF_FAMILY,
+    Signal("local_variance", "centre", _PER_SENSOR, "plain trace of the node's covariance", "own"),
+)
+
+
+def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
+    """Return the blocks of the observation with the sensors' sampling phases."""
+    own = partial(Block, labels=(numbered(sensors.count),), node="own")
+    since = "steps since the sensor's last sampling time over its period"
+    return (
+        own(
+            "sampled", "whether the sensor samples at this step", lambda s: sensors.sampled(s.time)
+        ),
+        own("phase", since, lambda s: (s.time % sensors.period) / sensors.period),
+    )
+
+
 @dataclass(frozen=True)
-class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
-    """The plant, its sensors, the nodes' filters, the joint recursion and a fusion rule.
+class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
+    """The nodes' filters, the joint recursion of the errors and a fusion rule.
 
     ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
     estimates and ``reference`` (n,) observed variances.
     """
 
-    plant: MarkovJumpPlant
-    sensors: FadingSensors
     model: AugmentedModel
     filters: LocalFilters
     recursion: LagRecursion
@@ -51,36 +125,34 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
     state_weights: Array
     magnitude: Array
     reference: Array
-    nature: Nature = AS_ASSUMED
     signals = SIGNALS
-    extensions = ("create", "full_rate_traces")
 
     @classmethod
     def create(
         cls,
-        plant: MarkovJumpPlant,
-        sensors: FadingSensors,
+        model: AugmentedModel,
         fusion: FusionRule,
         state_names: tuple[str, ...],
-        state_weights: Array | None,
+        state_weights: Array,
         horizon: int,
-        nature: Nature = AS_ASSUMED,
-    ) -> MarkovJumpSystem:
-        """Return the system with tables for ``horizon`` steps."""
-        common = cls._common_fields(plant, sensors, state_names, state_weights, horizon, nature)
-        filters = LocalFilters.create(common["model"], horizon)
-        recursion = LagRecursion.create(filters, plant.size)
-        return cls(**common, filters=filters, recursion=recursion, fusion=fusion)
+    ) -> MarkovJumpEstimator:
+        """Return the estimator with tables for ``horizon`` steps."""
+        filters = LocalFilters.create(model, horizon)
+        recursion = LagRecursion.create(filters, model.plant.size)
+        reference, magnitude = model.scales(horizon)
+        return cls(
+            model, filters, recursion, fusion, state_names, state_weights, magnitude, reference
+        )
 
     @property
-    def covariance_cycle(self) -> int:
+    def covariance_cycle(self) -> int:  # type: ignore[override]
         """Steps after which the sampling repeats; covariances do not depend on the data."""
         return self.filters.period
 
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes, states = (numbered(self.sensor_count),), (self.state_names,)
+        nodes, states = (numbered(self.model.sensors.count),), (self.state_names,)
         own = partial(Block, node="own", limit=_RANGE)
         fused = partial(Block, labels=states, limit=_RANGE)
         difference = "node's estimate minus the centre's copy, over its deviation"
@@ -91,7 +163,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         return (
             own("whitened_difference", difference, self._difference, nodes + states, "own"),
             own("whitened_innovation", innovation, self._whitened_innovation, nodes, "own"),
-            *sampling_blocks(self.sensors),
+            *sampling_blocks(self.model.sensors),
             age_block(*nodes),
             own(
                 "local_log_deviation",
@@ -121,20 +193,17 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             ),
         )
 
-    def start(self, noise: Array) -> MarkovJumpState:
-        """Draw the initial state; all estimates are the mean of ζ(0), without lags."""
-        runs, n, count = noise.shape[-1], self.plant.size, self.sensor_count
-        truth, mode, process_noise, departure = self._start(noise)
-        first = self.model.initial_mean
+    def start(self, measurement: Array, announcement: None) -> MarkovJumpEstimate:
+        """Return the mean of ζ(0) as all estimates, without lags; nothing is measured."""
+        plant, runs = self.model.plant, measurement.shape[-1]
+        n, count, first = plant.size, self.model.sensors.count, self.model.initial_mean
         mean = np.broadcast_to(first[:, None], (count, len(first), runs)).copy()
-        noise_mean = np.zeros((count, self.plant.process_gain.shape[1], runs))
-        state_mean = np.broadcast_to(self.plant.initial_mean, (n, runs)).copy()
-        covariance = np.broadcast_to(self.plant.initial_covariance, (n, n, runs)).copy()
-        return MarkovJumpState(
+        noise_mean = np.zeros((count, plant.process_gain.shape[1], runs))
+        state_mean = np.broadcast_to(plant.initial_mean, (n, runs)).copy()
+        covariance = np.broadcast_to(plant.initial_covariance, (n, n, runs)).copy()
+        return MarkovJumpEstimate(
             time=np.zeros(runs, dtype=np.int64),
-            truth=truth,
-            mode=mode,
-            process_noise=process_noise,
+            measurement=measurement,
             innovation=np.zeros((count, runs)),
             node_mean=mean,
             node_noise=noise_mean,
@@ -149,19 +218,15 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             prior_covariance=covariance,
             mean=state_mean,
             covariance=covariance,
-            departure=departure,
         )
 
-    def sense(self, state: MarkovJumpState, noise: Array) -> MarkovJumpState:
-        """Move the plant, measure, update the nodes, and predict the copies.
+    def predict(self, state: MarkovJumpEstimate) -> MarkovJumpEstimate:
+        """Predict nodes and copies, and fuse the copies without a transmission.
 
-        Source: markov_jump, equations (3), (4), (12)-(22), (36)-(39).
+        Source: markov_jump, equations (14)-(16), (36)-(39).
         """
-        truth, mode, process_noise, measurement = self._move(state, noise)
         time = state.time + 1
         before, place = self.filters.at(state.time), self.filters.at(time)
-        prior = self.filters.predict(state.node_mean, state.node_noise, before)
-        update = self.filters.update(prior, measurement, self.sensors.sampled(time), place)
         copy_mean = self.filters.predict(state.copy_mean, state.copy_noise, before)
         lags = self.recursion.predict(state.lags, state.sent, before)
         prediction = self.recursion.prediction(lags, place)
@@ -170,12 +235,9 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         return replace(
             state,
             time=time,
-            truth=truth,
-            mode=mode,
-            process_noise=process_noise,
-            innovation=update.innovation,
-            node_mean=update.mean,
-            node_noise=update.noise_mean,
+            innovation=np.zeros_like(state.innovation),
+            node_mean=self.filters.predict(state.node_mean, state.node_noise, before),
+            node_noise=np.zeros_like(state.node_noise),
             copy_mean=copy_mean,
             copy_noise=np.zeros_like(state.copy_noise),
             age=state.age + 1.0,
@@ -185,26 +247,42 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             prior_covariance=silent.covariance,
         )
 
-    def deliver(self, state: MarkovJumpState, granted: NDArray[np.bool_]) -> MarkovJumpState:
-        """Replace the centre's copies by granted estimates, and fuse the copies.
+    def observe(self, state: MarkovJumpEstimate, measurement: Array) -> MarkovJumpEstimate:
+        """Update the nodes that sample with their own measurements.
+
+        Source: markov_jump, equations (12)-(22).
+        """
+        sampled, place = self.model.sensors.sampled(state.time), self.filters.at(state.time)
+        update = self.filters.update(state.node_mean, measurement[:, 0], sampled, place)
+        return replace(
+            state,
+            measurement=np.where(sampled[:, None], measurement, np.nan),
+            innovation=update.innovation,
+            node_mean=update.mean,
+            node_noise=update.noise_mean,
+        )
+
+    def update(self, state: MarkovJumpEstimate, reception: Reception) -> MarkovJumpEstimate:
+        """Replace the centre's copies by the estimates that arrive, and fuse the copies.
 
         Source: markov_jump, equations (34)-(39), (55)-(57).
         """
-        grant = granted[:, None]
+        arrived, prediction = reception.arrived, sensed(state.prediction)
+        grant = arrived[:, None]
         copy_mean = np.where(grant, state.node_mean, state.copy_mean)
-        fused = self.fusion.fuse(self._collapse(copy_mean), sensed(state.prediction).joint(granted))
+        fused = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(arrived))
         return replace(
             state,
             copy_mean=copy_mean,
             copy_noise=np.where(grant, state.node_noise, state.copy_noise),
             held=np.where(grant, self._collapse(state.node_mean), state.held),
-            age=np.where(granted, 0.0, state.age),
-            sent=granted.copy(),
+            age=np.where(arrived, 0.0, state.age),
+            sent=arrived.copy(),
             mean=fused.mean,
             covariance=fused.covariance,
         )
 
-    def read(self, state: MarkovJumpState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+    def read(self, state: MarkovJumpEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
         prediction = sensed(state.prediction)
         place = self.filters.at(state.time)
@@ -224,10 +302,10 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             "centre_variance": lambda: linalg.trace(state.prior_covariance),
             "greedy_variance": lambda: self._greedy_variance(state, prediction),
             "local_variance": lambda: self.recursion.local_trace.take(place, -1),
-            "sampled": lambda: self.sensors.sampled(state.time),
+            "sampled": lambda: self.model.sensors.sampled(state.time),
         }
 
-    def local_means(self, state: MarkovJumpState) -> Array:
+    def local_means(self, state: MarkovJumpEstimate) -> Array:
         """Return the nodes' estimates (sensors, n, N)."""
         return self._collapse(state.node_mean)
 
@@ -237,7 +315,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         It is tr P_d of (33) in the steady state, with every node sending at every step.
         """
         local = self.recursion.local[..., -self.filters.period :]
-        means = np.zeros((self.sensor_count, self.plant.size, self.filters.period))
+        means = np.zeros((self.model.sensors.count, self.model.plant.size, self.filters.period))
         return linalg.trace(MatrixWeightedFusion().fuse(means, local).covariance)
 
     def _collapse(self, mean: Array) -> Array:
@@ -245,37 +323,37 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
 
         Source: markov_jump, equation (44).
         """
-        n = self.plant.size
+        n = self.model.plant.size
         result = mean[:, :n].copy()
         for first in range(n, mean.shape[1], n):
             result += mean[:, first : first + n]
         return result
 
-    def _difference(self, state: MarkovJumpState) -> Array:
+    def _difference(self, state: MarkovJumpEstimate) -> Array:
         lag = self._collapse(state.node_mean - state.copy_mean)
         return lag / self._lag_deviation(sensed(state.prediction))
 
-    def _whitened_innovation(self, state: MarkovJumpState) -> Array:
-        nodes, place = np.arange(self.sensor_count), self.filters.at(state.time)
+    def _whitened_innovation(self, state: MarkovJumpEstimate) -> Array:
+        nodes, place = np.arange(self.model.sensors.count), self.filters.at(state.time)
         variance = self.filters.innovation_covariance[nodes, nodes].take(place, -1)
         return state.innovation / np.sqrt(variance)
 
-    def _local_log_deviation(self, state: MarkovJumpState) -> Array:
+    def _local_log_deviation(self, state: MarkovJumpEstimate) -> Array:
         trace = self.recursion.local_trace.take(self.filters.at(state.time), -1)
         return log_deviation(trace[:, None, None], self.reference.sum(keepdims=True))[:, 0]
 
-    def _copy_log_deviation(self, state: MarkovJumpState) -> Array:
-        prediction, nodes = sensed(state.prediction), np.arange(self.sensor_count)
+    def _copy_log_deviation(self, state: MarkovJumpEstimate) -> Array:
+        prediction, nodes = sensed(state.prediction), np.arange(self.model.sensors.count)
         covariance = prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
         return log_deviation(covariance, self.reference)
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:
         """Return the predicted deviations (l, n, N) of node minus copy, above zero."""
-        nodes = np.arange(self.sensor_count)
+        nodes = np.arange(self.model.sensors.count)
         variance = linalg.diagonal(prediction.lag[nodes, nodes])
         return np.sqrt(np.maximum(variance, (_FLOOR * _FLOOR) * self.reference[:, None]))
 
-    def _variance_reduction(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
+    def _variance_reduction(self, state: MarkovJumpEstimate, prediction: JointPrediction) -> Array:
         silent = linalg.weighted_trace(state.prior_covariance, self.state_weights)
         silence = np.zeros(state.sent.shape, dtype=np.bool_)
         each = self._covariances_after_next(state, prediction, silence)
@@ -283,12 +361,12 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             [silent - linalg.weighted_trace(covariance, self.state_weights) for covariance in each]
         )
 
-    def _greedy_variance(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
+    def _greedy_variance(self, state: MarkovJumpEstimate, prediction: JointPrediction) -> Array:
         """Return the trace as sensors join in the order of the largest reduction."""
         sent = np.zeros(state.sent.shape, dtype=np.bool_)
-        sensors, result = np.arange(self.sensor_count)[:, None], np.empty(sent.shape)
+        sensors, result = np.arange(self.model.sensors.count)[:, None], np.empty(sent.shape)
         trace = linalg.trace(state.prior_covariance)
-        for _ in range(self.sensor_count):
+        for _ in range(self.model.sensors.count):
             each = self._covariances_after_next(state, prediction, sent)
             options = np.where(sent, np.inf, [linalg.trace(covariance) for covariance in each])
             selected = sensors == options.argmin(0)
@@ -297,11 +375,11 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         return result
 
     def _covariances_after_next(
-        self, state: MarkovJumpState, prediction: JointPrediction, sent: NDArray[np.bool_]
+        self, state: MarkovJumpEstimate, prediction: JointPrediction, sent: NDArray[np.bool_]
     ) -> list[Array]:
         """Return fused covariances (n, n, N) if ``sent`` (l, N) and one more sensor transmit."""
         means, each = self._collapse(state.copy_mean), []
-        for sensor in range(self.sensor_count):
+        for sensor in range(self.model.sensors.count):
             more = sent.copy()
             more[sensor] = True
             each.append(self.fusion.fuse(means, prediction.joint(more)).covariance)

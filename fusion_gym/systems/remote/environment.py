@@ -21,10 +21,10 @@ from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
 from fusion_gym.errors import forbidden
-from fusion_gym.systems.remote.system import RemoteEstimationSystem
+from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
 from fusion_gym.systems.silence import Silence, Trigger
 
-_FILTERS: dict[str, type] = {"symmetric": RemoteEstimationSystem, "truncated": Silence}
+_FILTERS: dict[str, type] = {"symmetric": RemoteEstimator, "truncated": Silence}
 
 
 @dataclass(frozen=True)
@@ -113,27 +113,26 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
     )
     deviation = validation.positive("noise_deviation", options.noise_deviation, (sensors,))
     coefficient = validation.spread("coefficient", options.coefficient, (sensors,))
-    system = RemoteEstimationSystem(
+    sources = ScalarSources(
         state_names=tuple(f"x{i + 1}" for i in range(len(coefficient))),
         coefficient=coefficient,
         deviation=deviation,
         initial_deviation=validation.not_negative(
             "initial_deviation", options.initial_deviation, (sensors,)
         ),
-        channel=_channel(options, sensors),
-        error_scale=_error_scale(options, deviation),
-        state_weights=weights,
         nature=_nature(options, coefficient),
-        silence=_silence(options, sensors),
     )
+    silence = _silence(options, sensors)
     return Scenario(
         options,
-        system,
+        sources,
+        RemoteEstimator(sources, _error_scale(options, deviation), weights, silence),
         weights,
         nodes_have_memory=True,  # a source's value is all that there is to know of it
         no_estimates="a packet carries the source's value",
-        policy_defaults={} if system.silence is None else system.silence.policy_defaults,
+        policy_defaults={} if silence is None else silence.policy_defaults,
         required_policy=options.trigger,
+        channel=_channel(options, sensors),
     )
 
 

@@ -27,8 +27,8 @@ from fusion_gym.systems.tobit.options import (
     at_the_nodes,
     classes,
     make_centre,
-    make_system,
-    memory_filter_system,
+    make_parts,
+    memory_filter_estimator,
     stochastic_defaults,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -62,7 +62,7 @@ class BiasedOscillatorOptions(FeedbackOptions):
         >>> from fusion_gym.systems.tobit.biased import BiasedOscillatorOptions
         >>> options = BiasedOscillatorOptions(censoring_upper=8.0)
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.access, task.horizon
+        >>> task.sensors, task.network.access, task.horizon
         (2, 'single', 100)
     """
 
@@ -130,7 +130,7 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
         >>> from fusion_gym.systems.tobit.biased import BiasedTrackingOptions
         >>> options = BiasedTrackingOptions(horizon=50)
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.access, task.horizon
+        >>> task.sensors, task.network.access, task.horizon
         (2, 'single', 50)
     """
 
@@ -172,17 +172,19 @@ def _build(options: BiasedOscillatorOptions) -> Scenario:
     centre = make_centre(options.filter, _FILTERS, options, sensors)
     names = [f"x{i + 1}" for i in range(states)]
     names += ["b"] if biases == 1 else [f"b{i + 1}" for i in range(biases)]
-    random = options.random_start
-    system = make_system(options, plant, centre, tuple(names), _REFERENCE_HORIZON, model, random)
-    weights = equal_weights(system.open_loop(horizon))
-    memory_system = memory_filter_system(system, options.memory_filter, _FILTERS, options, sensors)
+    truth, estimator = make_parts(
+        options, plant, centre, tuple(names), _REFERENCE_HORIZON, model, options.random_start
+    )
+    weights = equal_weights(plant.open_loop(horizon))
+    memory = memory_filter_estimator(estimator, options.memory_filter, _FILTERS, options, sensors)
     return Scenario(
         options,
-        system,
+        truth,
+        estimator,
         weights,
         stochastic_defaults(options),
         feedback=True,
-        memory_system=memory_system,
+        memory_estimator=memory,
     )
 
 

@@ -23,8 +23,8 @@ from fusion_gym.systems.tobit.options import (
     at_the_nodes,
     classes,
     make_centre,
-    make_system,
-    memory_filter_system,
+    make_parts,
+    memory_filter_estimator,
     stochastic_defaults,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -85,7 +85,7 @@ class LinearFusionOptions(FeedbackOptions):
         >>> options = LinearFusionOptions(transition=[[0.9]], process_covariance=[[1.0]],
         ...     measurement_matrices=[[1.0]])
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.system.state_names
+        >>> task.sensors, task.plant.state_names
         (1, ('x1',))
     """
 
@@ -158,19 +158,21 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
         _check_rules(choice)
     centre = make_centre(str(choice.filter), _FILTERS, choice, sensors)
     names = _names(choice.state_names, plant.size)
-    system = make_system(choice, plant, centre, names, _REFERENCE_HORIZON)
-    system = replace(system, known_start=True)
+    truth, estimator = make_parts(choice, plant, centre, names, _REFERENCE_HORIZON)
+    estimator = replace(estimator, known_start=True)
     holds = choice.filter == "hold"
     kind = "kalman" if holds and choice.memory_filter is None else choice.memory_filter
+    memory = memory_filter_estimator(estimator, kind, _FILTERS, choice, sensors)
     defaults = stochastic_defaults(choice)
     if isinstance(centre, TruncatedCentre):
         defaults |= centre.silence.policy_defaults
     return Scenario(
         choice,
-        system,
+        truth,
+        estimator,
         policy_defaults=defaults,
         feedback=True,
-        memory_system=memory_filter_system(system, kind, _FILTERS, choice, sensors),
+        memory_estimator=memory,
         no_estimates=_HELD if holds else None,
         required_policy=choice.trigger,
     )

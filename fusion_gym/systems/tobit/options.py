@@ -22,7 +22,7 @@ from fusion_gym.systems.tobit.centre import (
 )
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 from fusion_gym.validation import choice, not_negative
 
@@ -97,7 +97,7 @@ def make_centre(
     return filters[kind].make(options, sensors)
 
 
-def make_system(
+def make_parts(
     options: FeedbackOptions,
     plant: LinearPlant,
     centre: Centre,
@@ -105,8 +105,8 @@ def make_system(
     reference_horizon: int,
     model: LinearPlant | None = None,
     random_start: bool = False,
-) -> CensoredSystem:
-    """Return the system of a plant and a centre.
+) -> tuple[CensoredPlant, CensoredEstimator]:
+    """Return plant and estimator of a linear plant and a centre.
 
     Args:
         options: options of the environment.
@@ -124,31 +124,29 @@ def make_system(
     nature = Nature.create(options, (*plant.unmoved, *absent))
     nature.check_growth(plant.true_radius, options.horizon)
     plant.warn_of_unseen_growth(centre.sensors.stacked_matrix, state_names)
-    return CensoredSystem(
-        plant=plant,
+    estimator = CensoredEstimator(
         model=plant if model is None else model,
         centre=centre,
-        random_start=random_start,
         state_names=state_names,
         scale=typical_magnitude(plant, options.horizon, random_start),
         reference=plant.open_loop(min(options.horizon, reference_horizon)),
-        nature=nature,
     )
+    return CensoredPlant(plant, centre.sensors, state_names, random_start, nature), estimator
 
 
-def memory_filter_system(
-    system: CensoredSystem,
+def memory_filter_estimator(
+    estimator: CensoredEstimator,
     kind: str | None,
     filters: Mapping[str, Filter],
     options: FeedbackOptions,
     sensors: CensoredSensors,
-) -> CensoredSystem | None:
-    """Return the system with the filter of the option ``memory_filter``, or ``system`` itself.
+) -> CensoredEstimator | None:
+    """Return the estimator with the filter of the option ``memory_filter``, or ``None``.
 
-    Its options are the system's own where both filters have them, and otherwise defaults.
+    Its options are the environment's own where both filters have them, and otherwise defaults.
 
     Args:
-        system: the system.
+        estimator: the estimator.
         kind: name of the memory's filter, or None.
         filters: the table of filters.
         options: options of the environment.
@@ -163,7 +161,7 @@ def memory_filter_system(
     changed: dict[str, Any] = {"filter": kind}
     if not row.nodes:
         changed |= dict.fromkeys(_OF_FUSION)
-    return replace(system, centre=row.make(replace(options, **changed), sensors))
+    return replace(estimator, centre=row.make(replace(options, **changed), sensors))
 
 
 def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:

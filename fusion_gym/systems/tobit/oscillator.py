@@ -28,8 +28,8 @@ from fusion_gym.systems.tobit.options import (
     classes,
     feedback_centre,
     make_centre,
-    make_system,
-    memory_filter_system,
+    make_parts,
+    memory_filter_estimator,
     stochastic_defaults,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -75,7 +75,7 @@ class TobitOscillatorOptions(FeedbackOptions):
         >>> from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
         >>> options = TobitOscillatorOptions(filter="tobit", token_rate=2.0)
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.system.state_names
+        >>> task.sensors, task.plant.state_names
         (3, ('x1', 'x2'))
     """
 
@@ -148,14 +148,16 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
         memory_filter = "adf"
     names = tuple(f"x{i + 1}" for i in range(plant.size))
     random = options.random_start
-    system = make_system(options, plant, centre, names, horizon, random_start=random)
+    truth, estimator = make_parts(options, plant, centre, names, horizon, random_start=random)
+    memory = memory_filter_estimator(estimator, memory_filter, _FILTERS, options, sensors)
     defaults = {"dynamic_event": trigger} | stochastic_defaults(options)
     return Scenario(
         options,
-        system,
+        truth,
+        estimator,
         policy_defaults=defaults,
         feedback=True,
-        memory_system=memory_filter_system(system, memory_filter, _FILTERS, options, sensors),
+        memory_estimator=memory,
         no_estimates=_HELD if holds else None,
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
@@ -15,14 +14,21 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.estimator import Reception, SignalValues
+from fusion_gym.core.knowledge import Block, Signal, sensed
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.options import Scenario
-from fusion_gym.core.system import Block, Signal, SignalArray
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.importing import require
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
-from fusion_gym.systems.tobit.system import SIGNALS, CensoredState, CensoredSystem
+from fusion_gym.systems.tobit.system import (
+    SIGNALS,
+    CensoredEstimate,
+    CensoredEstimator,
+    CensoredPlant,
+    CensoredTruth,
+)
 from fusion_gym.validation import number, read_text
 
 _EXAMPLE = ("transition", "process_covariance", "initial_covariance", "measurement_matrices",
@@ -53,7 +59,7 @@ class RecordedFusionOptions(LinearFusionOptions):
     Example:
         >>> import fusion_gym
         >>> task = fusion_gym.make_task("fusion_gym/RecordedFusion-v1")
-        >>> task.noise.count, task.system.state_names
+        >>> task.noise.count, task.plant.state_names
         (29, ('inflow', 'middle', 'outflow'))
     """
 
@@ -72,20 +78,62 @@ class RecordedFusionOptions(LinearFusionOptions):
         return result
 
 
+class Announcement(NamedTuple):
+    """What an episode announces of its start: the mean (n, N), and the time of day (N,) in days."""
+
+    mean: Array
+    day: Array
+
+
+@dataclass(frozen=True)
+class RecordedPlant(CensoredPlant):
+    """A linear plant with gaps in its measurements: a measurement's noise of NaN is a gap."""
+
+    numpy_only = "log"  # type: ignore[assignment]
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start, and the time of day."""
+        return super().start_channels + 1
+
+    def start(self, noise: Array) -> tuple[CensoredTruth, Announcement]:
+        """See :class:`Plant`; the last normal is the time of day."""
+        first = 2 * self.dynamics.size
+        own = noise[first : first + self.sensor_count]
+        state, mean = super().start(np.nan_to_num(noise[:-1]))
+        return self._with_gaps(state, own), Announcement(mean, noise[-1])
+
+    def sense(self, state: CensoredTruth, noise: Array) -> CensoredTruth:
+        """See :class:`Plant`."""
+        own = noise[self.dynamics.noise_channels :]
+        return self._with_gaps(super().sense(state, np.nan_to_num(noise)), own)
+
+    def available(self, state: CensoredTruth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """See :class:`Plant`; lagged states have no truth of their own."""
+        present = np.isfinite(state.measurement[:, 0])
+        known = np.zeros(state.truth.shape, dtype=np.bool_)
+        known[: self.sensor_count] = present
+        return present, known
+
+    def _with_gaps(self, state: CensoredTruth, own: Array) -> CensoredTruth:
+        measurement = np.where(np.isfinite(own)[:, None], state.measurement, np.nan)
+        return replace(state, measurement=measurement)
+
+
 @dataclass(slots=True)
-class RecordedState(CensoredState):
-    """The state of N runs: also the sensors (l, N) with a reading, and the time of day (N,)."""
+class RecordedEstimate(CensoredEstimate):
+    """The estimate of N runs: also the sensors (l, N) with a reading, and the time of day (N,)."""
 
     available: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
     day: Array = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)
-class RecordedSystem(CensoredSystem):
-    """A linear plant with gaps in its measurements, and readings with level and daily cycle.
+class RecordedEstimator(CensoredEstimator):
+    """Filters of deviations whose signals are readings with level and daily cycle.
 
-    ``level`` (l, 5) has the constant, sine and cosine of one and of two periods a day;
-    ``step`` is a step in days. A measurement's noise of NaN is a gap.
+    ``level`` (l, 5) has the constant, sine and cosine of one and of two periods a day; ``step`` is
+    a step in days.
     """
 
     signals = (
@@ -95,22 +143,12 @@ class RecordedSystem(CensoredSystem):
     level: Array = field(default_factory=lambda: np.empty((0, 5)))
     step: float = 0.0
     numpy_only = "log"
-
-    def _level(self, state: RecordedState, time: Array) -> Array:
-        """Return what readings (l, 1, N) have beside deviations."""
-        turn = 2.0 * np.pi * (state.day + self.step * time)
-        waves = [np.ones_like(turn), np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
-        return (self.level @ np.array(waves))[:, None]
-
-    @property
-    def start_channels(self) -> int:
-        """Normals of a start, and the time of day."""
-        return super().start_channels + 1
+    covariance_cycle = None  # gaps make covariances unpredictable
 
     @property
     def observation(self) -> tuple[Block, ...]:
-        """See :class:`System`; exact sensors have no noise deviations to divide by."""
-        scale = self.scale[: self.sensor_count, None, None]
+        """See :class:`Estimator`; exact sensors have no noise deviations to divide by."""
+        scale = self.scale[: self.centre.sensors.count, None, None]
         return tuple(
             replace(
                 block,
@@ -123,71 +161,58 @@ class RecordedSystem(CensoredSystem):
             for block in super().observation
         )
 
-    def offers(self, capability: str) -> bool:
-        """See :class:`System`; gaps make covariances unpredictable."""
-        return capability == "available" or (
-            capability != "covariance_cycle" and super().offers(capability)
-        )
+    def start(self, measurement: Array, announcement: Any) -> RecordedEstimate:
+        """See :class:`Estimator`; a gap is filled with the expectation."""
+        mean, day = announcement
+        plain = replace(self, known_start=False)
+        first = CensoredEstimator.start(plain, measurement, mean)
+        start = RecordedEstimate(**_values(first), day=day)
+        prior = start.prior_mean, start.prior_covariance
+        start.prediction = self.centre.predict(*prior, np.nan_to_num(measurement), start.time)
+        state = self.observe(start, measurement)
+        state.prediction = self.centre.predict(*prior, state.measurement, state.time)
+        everyone = np.ones(state.age.shape, dtype=np.bool_)
+        result = self.update(replace(state, held=state.measurement), Reception(everyone))
+        return replace(result, prediction=None, age=np.zeros_like(state.age))
 
-    def available(self, state: CensoredState) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """See :class:`System`; lagged states have no truth of their own."""
-        assert isinstance(state, RecordedState)
-        known = np.zeros((self.plant.size, state.truth.shape[-1]), dtype=np.bool_)
-        known[: self.sensor_count] = state.available
-        return state.available, known
-
-    def start(self, noise: Array) -> RecordedState:
-        """See :class:`System`; the last normal is the time of day."""
-        first = 2 * self.plant.size
-        own = noise[first : first + self.sensor_count]
-        plain = CensoredSystem.start(replace(self, known_start=False), np.nan_to_num(noise[:-1]))
-        values = {item.name: getattr(plain, item.name) for item in fields(plain)}
-        state = RecordedState(**values, available=np.isfinite(own), day=noise[-1])
-        prediction = self.centre.predict(
-            state.mean, state.covariance, state.measurement, state.time
-        )
-        state = self._without_gaps(replace(state, prediction=prediction))
-        everyone = np.ones((self.sensor_count, noise.shape[-1]), dtype=np.bool_)
-        delivered = self.deliver(replace(state, held=state.measurement), everyone)
-        return replace(delivered, prediction=None, age=np.zeros_like(delivered.age))
-
-    def sense(self, state: CensoredState, noise: Array) -> RecordedState:
-        """See :class:`System`; held readings stay while the level moves."""
-        assert isinstance(state, RecordedState)
+    def predict(self, state: CensoredEstimate) -> RecordedEstimate:
+        """See :class:`Estimator`; held readings stay while the level moves."""
+        assert isinstance(state, RecordedEstimate)
         moved = self._level(state, state.time + 1.0) - self._level(state, state.time)
-        own = noise[self.plant.noise_channels :]
-        result = super().sense(
-            replace(state, held=state.held - moved, available=np.isfinite(own)),
-            np.nan_to_num(noise),
-        )
-        assert isinstance(result, RecordedState)
-        return self._without_gaps(result)
-
-    def _without_gaps(self, state: RecordedState) -> RecordedState:
-        """Return the state with the expectation where a sensor has no reading."""
-        assert state.prediction is not None
-        expected = state.prediction.expectation.value
-        measurement = np.where(state.available[:, None], state.measurement, expected)
-        return replace(state, measurement=measurement)
-
-    def deliver(self, state: CensoredState, granted: NDArray[np.bool_]) -> RecordedState:
-        """See :class:`System`; a sensor without a reading delivers nothing."""
-        assert isinstance(state, RecordedState)
-        result = super().deliver(state, granted & state.available)
-        assert isinstance(result, RecordedState)
+        result = super().predict(replace(state, held=state.held - moved))
+        assert isinstance(result, RecordedEstimate)
         return result
 
-    def single_deliveries(self, state: CensoredState) -> tuple[Array, Array]:
-        """See :class:`System`."""
-        mean, covariance = super().single_deliveries(state)
-        available, _ = self.available(state)
-        silent = self.deliver(state, np.zeros_like(available)).covariance
-        return mean, np.where(available[:, None, None], covariance, silent)
+    def observe(self, state: CensoredEstimate, measurement: Array) -> RecordedEstimate:
+        """See :class:`Estimator`; a sensor without a reading has the expectation."""
+        assert isinstance(state, RecordedEstimate)
+        available = np.isfinite(measurement[:, 0])
+        expected = sensed(state.prediction).expectation.value
+        filled = np.where(available[:, None], measurement, expected)
+        return replace(state, measurement=filled, available=available)
 
-    def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+    def update(self, state: CensoredEstimate, reception: Reception) -> RecordedEstimate:
+        """See :class:`Estimator`; a sensor without a reading delivers nothing."""
+        assert isinstance(state, RecordedEstimate)
+        arrived = reception.arrived & state.available
+        result = super().update(state, reception._replace(arrived=arrived))
+        assert isinstance(result, RecordedEstimate)
+        return result
+
+    def single_deliveries(self, state: CensoredEstimate) -> tuple[Array, Array] | None:
+        """See :class:`Estimator`."""
+        single = super().single_deliveries(state)
+        if single is None:
+            return None
+        assert isinstance(state, RecordedEstimate)
+        silence = Reception(np.zeros_like(state.available))
+        silent = self.update(state, silence).covariance
+        return single[0], np.where(state.available[:, None, None], single[1], silent)
+
+    def read(self, state: CensoredEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals, measurements as readings."""
-        assert isinstance(state, RecordedState)
-        signals, level = dict(super().read(state)), self._level(state, state.time)
+        assert isinstance(state, RecordedEstimate)
+        signals, level = dict(super().read(state, failure)), self._level(state, state.time)
         for name in ("measurement", "held", "expected_measurement"):
             signals[name] = np.asarray(signals[name]) + level
         reduction: Any = signals["variance_reduction"]
@@ -195,6 +220,12 @@ class RecordedSystem(CensoredSystem):
             "sampled": state.available,
             "variance_reduction": lambda: np.where(state.available, reduction(), 0.0),
         }
+
+    def _level(self, state: RecordedEstimate, time: Array) -> Array:
+        """Return what readings (l, 1, N) have beside deviations."""
+        turn = 2.0 * np.pi * (state.day + self.step * time)
+        waves = [np.ones_like(turn), np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
+        return (self.level @ np.array(waves))[:, None]
 
 
 @dataclass(frozen=True)
@@ -238,14 +269,9 @@ class WindowNoise:
         return self.start_rows[self.window(seed, episode), :channels]
 
     def steps(self, seed: int, episode: int, first: int, count: int, channels: int) -> Array:
-        """Return the normals (count, channels); a channel beyond the system's is drawn."""
+        """Return the normals (count, channels)."""
         begin = int(self.first[self.window(seed, episode)]) + first
-        rows = self.rows[begin : begin + count]
-        if channels == rows.shape[1]:
-            return rows
-        drawn = PhiloxNoise().steps(seed, episode, first, count, channels)
-        drawn[:, : rows.shape[1]] = rows
-        return drawn
+        return self.rows[begin : begin + count]
 
     def uniform(self, seed: int, episode: int) -> float:
         """Return the number in [0, 1) that draws the episode's price."""
@@ -307,18 +333,19 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
         raise refusal("log", choice.log, "the path of a CSV file")
     share = number("fit_share", choice.fit_share, above=0.0, at_most=0.95)
     scenario = build_linear(choice)
-    system = scenario.system
-    assert isinstance(system, CensoredSystem)
+    truth, memory = scenario.plant, scenario.memory_estimator
+    assert isinstance(truth, CensoredPlant)
+    plant = truth.dynamics
     if choice.source != "normal":
-        system.nature.refuse("with a recording", "the truth is the recording")
-    count, order = system.sensor_count, system.plant.size // system.sensor_count
-    names = None if choice.state_names is None else system.state_names[:count]
+        truth.nature.refuse("with a recording", "the truth is the recording")
+    count, order = truth.sensor_count, plant.size // truth.sensor_count
+    names = None if choice.state_names is None else truth.state_names[:count]
     modified = os.path.getmtime(choice.log) if os.path.exists(choice.log) else 0.0
     part = _part(choice.log, modified, names, share)
-    matrix = system.centre.sensors.measurement_matrix[:, 0, :, 0]
+    matrix = truth.sensors.measurement_matrix[:, 0, :, 0]
     if not np.array_equal(matrix, np.eye(count, count * order)):
         raise refusal("measurement_matrices", matrix, "rows of the identity, one for each channel")
-    plant, variance = system.plant, system.centre.sensors.variance[:, 0, 0]
+    variance = truth.sensors.variance[:, 0, 0]
     fitted = FittedPlant(
         part.names, plant.transition[..., 0], plant.process_covariance[..., 0], variance, order
     )
@@ -332,18 +359,22 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
         "resampled": lambda: ResampledNoise(_residuals(plant, part)),
         "recorded": lambda: _windows(plant, part, choice.horizon),
     }[choice.source]()
-    memory = scenario.memory_system
+    recorded = RecordedPlant(**_values(truth))
 
-    def recorded(own: CensoredSystem) -> RecordedSystem:
-        parts = {item.name: getattr(own, item.name) for item in fields(own)}
-        return RecordedSystem(**parts, level=part.level, step=part.step)
+    def estimator(own: Any) -> RecordedEstimator:
+        return RecordedEstimator(**_values(own), level=part.level, step=part.step)
 
     return replace(
         scenario,
-        system=recorded(system),
-        memory_system=recorded(memory) if isinstance(memory, CensoredSystem) else memory,
+        plant=recorded,
+        estimator=estimator(scenario.estimator),
+        memory_estimator=None if memory is None else estimator(memory),
         noise=noise,
     )
+
+
+def _values(record: Any) -> dict[str, Any]:
+    return {item.name: getattr(record, item.name) for item in fields(record)}
 
 
 def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:

@@ -36,7 +36,7 @@ from fusion_gym.systems.unknown_input.signals import (
     Sinusoids,
     Steps,
 )
-from fusion_gym.systems.unknown_input.system import UnknownInputSystem
+from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 from fusion_gym.validation import ConfigurationError
 
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
@@ -73,7 +73,7 @@ class UnknownInputOptions(PaperOptions):
         >>> from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
         >>> options = UnknownInputOptions(input_signal="steps")
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.system.state_names
+        >>> task.sensors, task.plant.state_names
         (3, ('position_1', 'velocity_1', 'position_2', 'velocity_2', 'force'))
     """
 
@@ -164,31 +164,35 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
     weights = _weights(options, open_loop, plant.inputs)
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    plant.warn_of_unseen_growth(sensors.measurement_matrix, _state_names(options, plant))
-    system = UnknownInputSystem(
-        plant=plant,
-        signal=signal,
+    names = _state_names(options, plant)
+    plant.warn_of_unseen_growth(sensors.measurement_matrix, names)
+    truth = DrivenPlant(plant, signal, sensors, names, nature)
+    estimator = UnknownInputEstimator(
         nodes=_nodes(options, plant, sensors, horizon),
-        state_names=_state_names(options, plant),
+        state_names=names,
         state_weights=weights,
         magnitude=plant.magnitude(signal, horizon),
         reference=open_loop,
-        nature=nature,
     )
+    memory = _with_memory_filter(options, estimator, plant, horizon)
     return Scenario(
         options,
-        system,
+        truth,
+        estimator,
         weights,
         {"adaptive_threshold": trigger},
-        memory_system=_with_memory_filter(options, system, sensors, horizon),
+        memory_estimator=memory,
         no_estimates="the centre computes each estimate from the packets of the nodes",
     )
 
 
 def _with_memory_filter(
-    options: UnknownInputOptions, system: UnknownInputSystem, sensors: InputSensors, horizon: int
-) -> UnknownInputSystem | None:
-    """Return the system with the filter of ``memory_filter``, or the system's own for ``None``.
+    options: UnknownInputOptions,
+    estimator: UnknownInputEstimator,
+    plant: UnknownInputPlant,
+    horizon: int,
+) -> UnknownInputEstimator | None:
+    """Return the estimator with the filter of ``memory_filter``, or ``None`` for the same filter.
 
     The paper's filter, which minimises a bound, uses the random walk's.
     """
@@ -199,7 +203,7 @@ def _with_memory_filter(
         kind = "random_walk"
     validation.choice("memory_filter", kind, FILTERS)
     other = replace(options, filter=kind, hold_variance=None)
-    return replace(system, nodes=_nodes(other, system.plant, sensors, horizon))
+    return replace(estimator, nodes=_nodes(other, plant, estimator.nodes.sensors, horizon))
 
 
 def _with_example(options: UnknownInputOptions) -> UnknownInputOptions:

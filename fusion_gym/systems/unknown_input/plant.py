@@ -15,23 +15,23 @@ from scipy.special import ndtr
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
-from fusion_gym.systems.linear_plant import Plant, covariance_factor
+from fusion_gym.systems.linear_plant import LinearDynamics, covariance_factor
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
 _LONGEST_PERIOD = 1000  # small steps between two instants
 
 
 @dataclass(frozen=True)
-class UnknownInputPlant(Plant):
+class UnknownInputPlant(LinearDynamics):
     """x(k + 1) = 𝒜 x(k) + ℬ d(k) + w(k), w ~ N(0, 𝒲), from one sampling instant to the next.
 
     Between two instants the plant makes ``sampling_period`` a small steps x' = A x + B d + ω, ω ~
     N(0, W), with a constant input d. So 𝒜 = Aᵃ, ℬ = Σ Aʲ B and 𝒲 = Σ Aʲ W Aʲᵀ over j = 0..a - 1.
     One draw per instant is exact, because no filter and no sensor uses the small steps.
 
-    In addition to the shapes of :class:`~fusion_gym.systems.linear_plant.Plant`, with 𝒜 and 𝒲:
-    ``input_matrix`` ℬ (n, q, 1), and ``initial_half_width`` (n, 1) of a uniform x(0) about the
-    mean, which filters assume to be normal.
+    In addition to the shapes of the base, with 𝒜 and 𝒲: ``input_matrix`` ℬ (n, q, 1), and
+    ``initial_half_width`` (n, 1) of a uniform x(0) about the mean, which filters assume to be
+    normal.
 
     Source: unknown_input, equations (1), (3) and (4), lifted with a constant input.
     """

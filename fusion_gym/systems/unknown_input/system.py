@@ -5,30 +5,29 @@ cyber-physical systems with unknown inputs under adaptive event-triggered mechan
 """
 
 import functools
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.system import (
+from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.knowledge import (
     Block,
-    SignalArray,
-    System,
     age_block,
     common_signals,
     log_deviation,
     numbered,
     sensed,
 )
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.plant import Plant
 from fusion_gym.systems.linear_plant import largest_ratio
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
+from fusion_gym.systems.unknown_input.sensors import InputSensors
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
@@ -36,25 +35,153 @@ _IMAGINED = 32  # signals of which one is taken, where one is imagined
 
 
 @dataclass(slots=True)
-class UnknownInputState:
-    """The state of N runs at one time; n states, q inputs, s = n + q, l sensors, m components.
+class UnknownInputTruth:
+    """The true state of N runs at one time; n states, q inputs, s = n + q, l sensors, m components.
 
     ``truth`` (s, N), the state x(k) and the input d(k - 1) that has just acted · ``signal``
     (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since the start ·
-    ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
-    instants since then · ``estimates``, the posteriors · ``prediction``, the predictions ·
-    ``departure`` (4, N) of the truth from the model, if any.
+    ``measurement`` (l, m, N) · ``departure`` (4, N) of the truth from the model, if any.
     """
 
     truth: Array
     signal: Array
     time: Array
     measurement: Array
+    departure: Array | None = None
+
+
+@dataclass(frozen=True)
+class DrivenPlant(Plant[UnknownInputTruth]):
+    """A linear plant under an input signal, with its sensors.
+
+    One step is one sampling instant. ``nature`` is the departure of the truth from this model.
+    """
+
+    dynamics: UnknownInputPlant
+    signal: InputSignal
+    sensors: InputSensors
+    state_names: tuple[str, ...]
+    nature: Nature = AS_ASSUMED
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.sensors.count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: input, process noise, sensors."""
+        own = self.dynamics.noise_channels + self.sensors.noise_channels
+        return self.signal.noise_channels + own
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: initial state, first measurements, signal, nature's."""
+        own = self.dynamics.size + self.sensors.noise_channels
+        return own + self.signal.start_channels + self.nature.channels
+
+    def start(self, noise: Array) -> tuple[UnknownInputTruth, None]:
+        """Draw the initial state, and measure it."""
+        n, runs, count = self.dynamics.size, noise.shape[-1], self.sensors.noise_channels
+        noise, departure = self.nature.begin(noise)
+        state = self.dynamics.start(noise[:n])
+        first = true_noise(departure, noise[:0], noise[n : n + count])[1]
+        return UnknownInputTruth(
+            truth=np.concatenate((state, np.zeros((self.dynamics.inputs, runs)))),
+            signal=self.signal.start(noise[n + count :]),
+            time=np.zeros(runs),
+            measurement=self.sensors.measure(state, first),
+            departure=departure,
+        ), None
+
+    def sense(self, state: UnknownInputTruth, noise: Array) -> UnknownInputTruth:
+        """Move the plant under the input for one interval, and measure.
+
+        Source: unknown_input, equations (2) and (4).
+        """
+        r, drawn = self.dynamics.noise_channels, self.signal.noise_channels
+        inputs = self.signal.value(state.signal, state.time)
+        departure = state.departure
+        process, own = true_noise(departure, noise[drawn : drawn + r], noise[drawn + r :])
+        last = state.truth[: self.dynamics.size]
+        moved = self.dynamics.advance(last, inputs, process, departure)
+        return replace(
+            state,
+            truth=np.concatenate((moved, inputs)),
+            signal=self.signal.advance(state.signal, noise[:drawn]),
+            time=state.time + 1.0,
+            measurement=self.sensors.measure(moved, own),
+        )
+
+    @property
+    def draw_channels(self) -> int | None:
+        """Number of states, and the normals of ``_IMAGINED`` signals; ``None`` if it is fixed."""
+        if not self.signal.start_channels:
+            return None
+        signal = self.signal.noise_channels + _IMAGINED * (self.signal.start_channels + 1)
+        return self.dynamics.size + signal
+
+    def draw(
+        self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
+    ) -> UnknownInputTruth:
+        """Draw the signal from its law and the belief about the input that has just acted.
+
+        Of ``_IMAGINED`` signals drawn as at a start, one is chosen in proportion to the density of
+        its last value under N(mean, covariance). The rest of the truth follows that distribution,
+        given this value. The draw ignores older estimates of the signal.
+        """
+        n, steps, runs = self.dynamics.size, self.signal.noise_channels, len(time)
+        first, moving, drawn = np.split(noise, (n, n + steps))
+        choice, starts = drawn[:_IMAGINED], drawn[_IMAGINED:].reshape(-1, _IMAGINED * runs)
+        last = np.tile(time - 1.0, _IMAGINED)
+        memories = self.signal.start(starts)
+        values = self.signal.value(memories, last).reshape(-1, _IMAGINED, runs)
+        apart = np.moveaxis(values - mean[n:, None], 1, 0)
+        spread = covariance[n:, n:]
+        # The largest of Gumbel numbers moved by log weights is a draw with these weights.
+        weight = -0.5 * linalg.dot(apart, linalg.solve_vector(spread, apart))
+        choices = (weight - np.log(-np.log(ndtr(choice)))).argmax(0)
+        memory = memories.reshape(-1, _IMAGINED, runs)[:, choices, np.arange(runs)]
+        off = apart[choices, :, np.arange(runs)].T
+        cross = covariance[:n, n:]
+        gained = linalg.solve(spread, linalg.transpose(cross))
+        left = linalg.symmetrise(covariance[:n, :n] - linalg.matmul(cross, gained))
+        moved = mean[:n] + linalg.matvec(linalg.transpose(gained), off)
+        return UnknownInputTruth(
+            truth=np.concatenate((linalg.draw_normal(moved, left, first), mean[n:] + off)),
+            signal=self.signal.advance(memory, moving),
+            time=time,
+            measurement=measurement,
+        )
+
+    def open_loop(self, horizon: int) -> Array:
+        """Return the mean squared error (n + q,) over k = 1..horizon of a prediction with d = 0."""
+        return self.dynamics.open_loop(self.signal, horizon)
+
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """See :class:`Plant`."""
+        dynamics, sensors = self.dynamics, self.sensors
+        moments = dynamics.second_moments(self.signal, horizon, dynamics.initial_mean[:, 0])
+        deviation = np.sqrt(linalg.diagonal(sensors.covariance))
+        rows = sensors.measurement_matrix[..., 0] / deviation
+        return largest_ratio(moments[:, : dynamics.size], rows), 0.0
+
+
+@dataclass(slots=True)
+class UnknownInputEstimate:
+    """The estimates of N runs at one time; l sensors, m components.
+
+    ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
+    sampling instants since then · ``time`` (N,), instants since the start · ``estimates``, the
+    posteriors · ``prediction``, the predictions.
+    """
+
+    measurement: Array
     held: Array
     age: Array
+    time: Array
     estimates: Estimates
     prediction: NodePrediction | None
-    departure: Array | None = None
 
 
 SIGNALS = common_signals(
@@ -66,60 +193,35 @@ SIGNALS = common_signals(
 
 
 @dataclass(frozen=True)
-class UnknownInputSystem(System[UnknownInputState]):
-    """A plant, its input signal, and nodes with a fusion centre.
+class UnknownInputEstimator(Estimator[UnknownInputEstimate]):
+    """Nodes with a fusion centre, without feedback.
 
     The estimated quantity is [x(k); d(k - 1)]: an input becomes observable only after it has acted.
-    One step is one sampling instant. ``state_weights`` (s,) weigh the traces among the signals,
-    ``magnitude`` (s,) divides observed estimates, and ``reference`` (s,) observed variances.
+    ``state_weights`` (s,) weigh the traces among the signals, ``magnitude`` (s,) divides observed
+    estimates, and ``reference`` (s,) observed variances.
     """
 
-    plant: UnknownInputPlant
-    signal: InputSignal
     nodes: Nodes
     state_names: tuple[str, ...]
     state_weights: Array
     magnitude: Array
     reference: Array
-    nature: Nature = AS_ASSUMED
     signals = SIGNALS
-    covariance_cycle = 1  # the recursion of the covariances does not depend on time
 
     @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.nodes.sensors.count
+    def covariance_cycle(self) -> int | None:  # type: ignore[override]
+        """1 if nodes predict without a delivery, so that covariances follow from the deliveries.
 
-    @property
-    def noise_channels(self) -> int:
-        """Normals of one step: input, process noise, sensors."""
-        own = self.plant.noise_channels + self.nodes.sensors.noise_channels
-        return self.signal.noise_channels + own
-
-    @property
-    def start_channels(self) -> int:
-        """Normals of a start: initial state, first measurements, signal, nature's."""
-        own = self.plant.size + self.nodes.sensors.noise_channels
-        return own + self.signal.start_channels + self.nature.channels
-
-    def offers(self, capability: str) -> bool:
-        """See :class:`System`.
-
-        Covariances follow from the deliveries if nodes predict without a delivery: not with the
-        paper's filter, nor with a hold variance, whose covariance ignores the age of the held
-        measurement. They refer to the filter's model of the input. A fixed signal cannot be
-        imagined.
+        They do not with the paper's filter, nor with a hold variance, whose covariance ignores the
+        age of the held measurement. They refer to the filter's model of the input.
         """
-        if capability == "covariance_cycle":
-            return isinstance(self.nodes, RunNodes) and self.nodes.hold_variance is None
-        if capability in ("imagine", "imagination_channels"):
-            return self.signal.start_channels > 0
-        return super().offers(capability)
+        follows = isinstance(self.nodes, RunNodes) and self.nodes.hold_variance is None
+        return 1 if follows else None
 
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation; a "state" is a state or an input."""
-        nodes, states = (numbered(self.sensor_count),), (self.state_names,)
+        nodes, states = (numbered(self.nodes.sensors.count),), (self.state_names,)
         own = partial(Block, node="own", limit=_RANGE)
         new = partial(own, labels=(*nodes, numbered(self.nodes.sensors.size)), knowledge="own")
         fused = partial(Block, labels=states, limit=_RANGE)
@@ -156,64 +258,43 @@ class UnknownInputSystem(System[UnknownInputState]):
             ),
         )
 
-    def start(self, noise: Array) -> UnknownInputState:
-        """Draw the initial state; every first measurement is known without charge."""
-        n, sensors = self.plant.size, self.nodes.sensors
-        runs, count = noise.shape[-1], sensors.noise_channels
-        noise, departure = self.nature.begin(noise)
-        state = self.plant.start(noise[:n])
-        first = true_noise(departure, noise[:0], noise[n : n + count])[1]
-        measurement = sensors.measure(state, first)
-        return UnknownInputState(
-            truth=np.concatenate((state, np.zeros((self.plant.inputs, runs)))),
-            signal=self.signal.start(noise[n + count :]),
-            time=np.zeros(runs),
+    def start(self, measurement: Array, announcement: None) -> UnknownInputEstimate:
+        """Return equal estimates; every first measurement is known without charge."""
+        runs = measurement.shape[-1]
+        return UnknownInputEstimate(
             measurement=measurement,
             held=measurement,
-            age=np.zeros((sensors.count, runs)),
+            age=np.zeros((self.nodes.sensors.count, runs)),
+            time=np.zeros(runs),
             estimates=self.nodes.start(runs),
             prediction=None,
-            departure=departure,
         )
 
-    def sense(self, state: UnknownInputState, noise: Array) -> UnknownInputState:
-        """Move the plant under the input for one interval, measure, and predict at the nodes.
-
-        Source: unknown_input, equations (2) and (4).
-        """
-        r, drawn = self.plant.noise_channels, self.signal.noise_channels
-        inputs = self.signal.value(state.signal, state.time)
-        departure = state.departure
-        process, own = true_noise(departure, noise[drawn : drawn + r], noise[drawn + r :])
-        moved = self.plant.advance(state.truth[: self.plant.size], inputs, process, departure)
+    def predict(self, state: UnknownInputEstimate) -> UnknownInputEstimate:
+        """Predict at the nodes."""
         time = state.time + 1.0
-        return replace(
-            state,
-            truth=np.concatenate((moved, inputs)),
-            signal=self.signal.advance(state.signal, noise[:drawn]),
-            time=time,
-            measurement=self.nodes.sensors.measure(moved, own),
-            age=state.age + 1.0,
-            prediction=self.nodes.predict(state.estimates, time),
-        )
+        prediction = self.nodes.predict(state.estimates, time)
+        return replace(state, age=state.age + 1.0, time=time, prediction=prediction)
 
-    def deliver(self, state: UnknownInputState, granted: NDArray[np.bool_]) -> UnknownInputState:
-        """Update the nodes with the granted (sensors, N) measurements, and fuse.
+    def observe(self, state: UnknownInputEstimate, measurement: Array) -> UnknownInputEstimate:
+        """Take the measurement."""
+        return replace(state, measurement=measurement)
+
+    def update(self, state: UnknownInputEstimate, reception: Reception) -> UnknownInputEstimate:
+        """Update the nodes with the measurements that arrive, and fuse.
 
         Source: unknown_input, equations (8), (24), (25).
         """
-        prediction = sensed(state.prediction)
-        held = np.where(granted[:, None], state.measurement, state.held)
+        prediction, arrived = sensed(state.prediction), reception.arrived
+        held = np.where(arrived[:, None], state.measurement, state.held)
         return replace(
             state,
             held=held,
-            age=np.where(granted, 0.0, state.age),
-            estimates=self.nodes.update(state.estimates, prediction, held, granted, state.time),
+            age=np.where(arrived, 0.0, state.age),
+            estimates=self.nodes.update(state.estimates, prediction, held, arrived, state.time),
         )
 
-    def read(
-        self, state: UnknownInputState
-    ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+    def read(self, state: UnknownInputEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
         prediction = sensed(state.prediction)
 
@@ -231,84 +312,28 @@ class UnknownInputSystem(System[UnknownInputState]):
             "age": state.age,
             "expected_measurement": prediction.expected,
             "innovation_deviation": lambda: everyone(self._deviation(state)),
-            "prior_mean": prediction.fused_mean[: self.plant.size],
+            "prior_mean": prediction.fused_mean[: self.nodes.model.size],
             "prior_covariance": lambda: everyone(self._fused_prior(state)),
             "silent_variance": lambda: variances()[0],
             "variance_reduction": lambda: variances()[1],
         }
 
-    def visible(self, state: UnknownInputState) -> UnknownInputState:
-        """Return the state without the truth, the coming input and the departure."""
-        return replace(
-            state,
-            truth=np.full_like(state.truth, np.nan),
-            signal=np.full_like(state.signal, np.nan),
-            departure=None,
-        )
+    def mean(self, state: UnknownInputEstimate) -> Array:
+        """Return the centre's mean (n + q, N)."""
+        return state.estimates.fused_mean
 
-    @property
-    def imagination_channels(self) -> int:
-        """Number of states, and the normals of ``_IMAGINED`` signals."""
-        signal = self.signal.noise_channels + _IMAGINED * (self.signal.start_channels + 1)
-        return self.plant.size + signal
-
-    def imagine(
-        self, state: UnknownInputState, mean: Array, covariance: Array, noise: Array
-    ) -> UnknownInputState:
-        """Draw the signal from its law and the belief about the input that has just acted.
-
-        Of ``_IMAGINED`` signals drawn as at a start, one is chosen in proportion to the density of
-        its last value under N(mean, covariance). The rest of the truth follows that distribution,
-        given this value. The draw ignores older estimates of the signal.
-        """
-        n, steps, runs = self.plant.size, self.signal.noise_channels, len(state.time)
-        first, moving, drawn = np.split(noise, (n, n + steps))
-        choice, starts = drawn[:_IMAGINED], drawn[_IMAGINED:].reshape(-1, _IMAGINED * runs)
-        last = np.tile(state.time - 1.0, _IMAGINED)
-        memories = self.signal.start(starts)
-        values = self.signal.value(memories, last).reshape(-1, _IMAGINED, runs)
-        apart = np.moveaxis(values - mean[n:, None], 1, 0)
-        spread = covariance[n:, n:]
-        # The largest of Gumbel numbers moved by log weights is a draw with these weights.
-        weight = -0.5 * linalg.dot(apart, linalg.solve_vector(spread, apart))
-        choices = (weight - np.log(-np.log(ndtr(choice)))).argmax(0)
-        memory = memories.reshape(-1, _IMAGINED, runs)[:, choices, np.arange(runs)]
-        off = apart[choices, :, np.arange(runs)].T
-        cross = covariance[:n, n:]
-        gained = linalg.solve(spread, linalg.transpose(cross))
-        left = linalg.symmetrise(covariance[:n, :n] - linalg.matmul(cross, gained))
-        moved = mean[:n] + linalg.matvec(linalg.transpose(gained), off)
-        return replace(
-            state,
-            truth=np.concatenate((linalg.draw_normal(moved, left, first), mean[n:] + off)),
-            signal=self.signal.advance(memory, moving),
-            departure=None,
-        )
-
-    def fused(self, state: UnknownInputState) -> tuple[Array, Array]:
-        """Return the centre's mean (n + q, N) and covariance (n + q, n + q, N)."""
+    def covariance(self, state: UnknownInputEstimate) -> Array:
+        """Return the centre's covariance (n + q, n + q, N)."""
         covariance = self.nodes.fused_covariance(state.estimates, state.time)
-        return state.estimates.fused_mean, _lanes(covariance, len(state.time))
+        return _lanes(covariance, len(state.time))
 
-    def local_means(self, state: UnknownInputState) -> Array:
+    def local_means(self, state: UnknownInputEstimate) -> Array:
         """Return the nodes' posterior means (sensors, n + q, N)."""
         return state.estimates.mean
 
-    def open_loop(self, horizon: int) -> Array:
-        """Return the mean squared error (n + q,) over k = 1..horizon of a prediction with d = 0."""
-        return self.plant.open_loop(self.signal, horizon)
-
-    def rounding(self, horizon: int) -> tuple[float, float]:
-        """See :class:`System`."""
-        plant, sensors = self.plant, self.nodes.sensors
-        moments = plant.second_moments(self.signal, horizon, plant.initial_mean[:, 0])
-        deviation = np.sqrt(linalg.diagonal(sensors.covariance))
-        rows = sensors.measurement_matrix[..., 0] / deviation
-        return largest_ratio(moments[:, : plant.size], rows), 0.0
-
-    def _deviation(self, state: UnknownInputState) -> Array:
+    def _deviation(self, state: UnknownInputEstimate) -> Array:
         """Return the innovation's deviation (l, m, N or 1)."""
-        n, sensors = self.plant.size, self.nodes.sensors
+        n, sensors = self.nodes.model.size, self.nodes.sensors
         prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
         spread = linalg.matmul(sensors.measurement_matrix, prior[:, :n, :n])
         variance = spread[..., 0, :] * sensors.measurement_matrix[..., 0, :]
@@ -322,19 +347,19 @@ class UnknownInputSystem(System[UnknownInputState]):
         """√2 deviations of the measurement noise, (l, m, 1)."""
         return np.sqrt(2.0 * linalg.diagonal(self.nodes.sensors.covariance))
 
-    def _whitened(self, state: UnknownInputState) -> Array:
+    def _whitened(self, state: UnknownInputEstimate) -> Array:
         return (state.measurement - sensed(state.prediction).expected) / self._deviation(state)
 
-    def _local_log_deviation(self, state: UnknownInputState) -> Array:
+    def _local_log_deviation(self, state: UnknownInputEstimate) -> Array:
         prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
         return _lanes(log_deviation(prior, self.reference), len(state.time))
 
-    def _log_deviation(self, state: UnknownInputState) -> Array:
+    def _log_deviation(self, state: UnknownInputEstimate) -> Array:
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
         return _lanes(log_deviation(before, self.reference), len(state.time))
 
-    def _fused_prior(self, state: UnknownInputState) -> Array:
-        n = self.plant.size
+    def _fused_prior(self, state: UnknownInputEstimate) -> Array:
+        n = self.nodes.model.size
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
         return self.nodes.model.predict_covariance(before)[:n, :n]
 

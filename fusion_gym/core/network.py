@@ -1,0 +1,238 @@
+"""The network: who may transmit, what it costs, and what arrives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.access import ACCESS_RULES, access_mask, first_request
+from fusion_gym.core.channel import Channel
+from fusion_gym.core.estimator import Reception
+from fusion_gym.core.token_bucket import Grants, Queue, TokenBucket
+from fusion_gym.errors import forbidden
+from fusion_gym.namespace import namespace, ndtr
+
+
+@dataclass(slots=True)
+class NetworkState:
+    """The network of N runs before the requests of a step; l sensors, delays of at most D steps.
+
+    ``tokens`` (N,) · ``queue`` (l, N), the place of each sensor · ``admitted`` (l, N) bool, by the
+    access rule · ``channel`` (l, N), the channels' state at the step before, which is fed back.
+    Hidden are ``following`` (l, N), the channels' present state, ``lost`` (l, N) bool, whether a
+    packet sent now is lost, ``delay`` (l, N), its delay in steps, and ``due`` (D, l, N), the delay
+    of the packet that was sent 1, …, D steps ago, 0 without one. ``None`` is absent.
+    """
+
+    tokens: Array
+    queue: Queue
+    admitted: NDArray[np.bool_]
+    channel: NDArray[np.int64] | None = None
+    following: NDArray[np.int64] | None = None
+    lost: NDArray[np.bool_] | None = None
+    delay: NDArray[np.int64] | None = None
+    due: NDArray[np.int64] | None = None
+
+
+class Delivery(NamedTuple):
+    """The network's response to the requests of a step.
+
+    Attributes:
+        granted: Sensors (l, N) bool.
+        spent: Tokens spent (N,).
+        reception: Packets that arrive at once.
+    """
+
+    granted: NDArray[np.bool_]
+    spent: Array
+    reception: Reception
+
+
+@dataclass(frozen=True)
+class Network:
+    """Medium access, tokens, losses and delays, with noise of its own.
+
+    Args:
+        bucket: The token bucket.
+        access: Rule of :mod:`fusion_gym.core.access`.
+        channel: Losses; ``None`` loses nothing.
+        delay: Probabilities of a delay of 0, 1, … steps, drawn for each packet.
+
+    Raises:
+        ConfigurationError: The rule is unknown, or the probabilities do not sum to 1.
+
+    Example:
+        >>> from fusion_gym.core.network import Network
+        >>> from fusion_gym.core.token_bucket import TokenBucket
+        >>> network = Network(TokenBucket.create(1.0, 5.0, 2.0, 1.0, sensors=2))
+        >>> network.sensors, network.noise_channels
+        (2, 0)
+    """
+
+    bucket: TokenBucket
+    access: str = "any"
+    channel: Channel | None = None
+    delay: tuple[float, ...] = field(default=(1.0,))
+
+    def __post_init__(self) -> None:
+        validation.choice("access", self.access, ACCESS_RULES)
+        law = validation.not_negative("delay", self.delay, (len(self.delay),))
+        if abs(law.sum() - 1.0) > 1e-9:
+            raise forbidden("delay", self.delay, "it must have probabilities that sum to 1")
+
+    @property
+    def sensors(self) -> int:
+        """Number of sensors."""
+        return len(self.bucket.cost)
+
+    @property
+    def start_channels(self) -> int:
+        """Number of standard normals that :meth:`start` takes per run."""
+        return self.sensors * self._moves
+
+    @property
+    def draw_channels(self) -> int:
+        """Number of standard normals that :meth:`draw` takes per run."""
+        return self.sensors * (self._moves + self._loses + (self._longest > 0))
+
+    @property
+    def noise_channels(self) -> int:
+        """Number of standard normals that :meth:`advance` takes per run."""
+        return (self.access == "random") + self.draw_channels
+
+    @property
+    def _longest(self) -> int:
+        """Largest delay D, in steps."""
+        return len(self.delay) - 1
+
+    @property
+    def _moves(self) -> bool:
+        return self.channel is not None and self.channel.states > 1
+
+    @property
+    def _loses(self) -> bool:
+        return self.channel is not None and self.channel.loses
+
+    def start(self, noise: Array) -> NetworkState:
+        """Return the state at time 0.
+
+        Args:
+            noise: Standard normals (start_channels, N).
+        """
+        runs, longest = noise.shape[-1], self._longest
+        channel = self.channel.start(noise) if self.channel is not None and self._moves else None
+        due = np.zeros((longest, self.sensors, runs), dtype=np.int64) if longest else None
+        everyone = np.ones((self.sensors, runs), dtype=np.bool_)
+        bucket = self.bucket
+        return NetworkState(
+            bucket.start(runs), bucket.start_queue(runs), everyone, channel, channel, due=due
+        )
+
+    def advance(self, state: NetworkState, noise: Array, step: NDArray[np.int64]) -> NetworkState:
+        """Return the state before the requests of the next step.
+
+        Args:
+            state: Any state.
+            noise: Standard normals (noise_channels, N).
+            step: Steps taken so far (N,).
+        """
+        admitted = state.admitted
+        if self.access in ("round_robin", "random"):
+            lottery = noise[0] if self.access == "random" else None
+            admitted = access_mask(self.access, self.sensors, step, lottery)
+            noise = noise if lottery is None else noise[1:]
+        moved = NetworkState(
+            state.tokens, state.queue, admitted, state.following, state.following, due=state.due
+        )
+        return self.draw(moved, noise) if len(noise) else moved
+
+    def draw(self, state: NetworkState, noise: Array) -> NetworkState:
+        """Return a state with new hidden parts, from the channels' state that was fed back.
+
+        Args:
+            state: Any state.
+            noise: Standard normals (draw_channels, N).
+        """
+        parts = iter(noise.reshape(-1, self.sensors, noise.shape[-1]))
+        following, lost, delay = state.channel, None, None
+        if self.channel is not None and following is not None:
+            following = self.channel.advance(following, next(parts))
+        if self.channel is not None and self._loses:
+            own = next(parts)
+            present = np.zeros(own.shape, dtype=np.int64) if following is None else following
+            lost = self.channel.lost(present, own)
+        if self._longest:
+            reached = np.cumsum(self.delay)[:-1, None, None]
+            delay = (ndtr(next(parts)) >= reached).sum(0)
+        return replace(state, following=following, lost=lost, delay=delay)
+
+    def grant(
+        self, state: NetworkState, requests: NDArray[np.bool_], runs: Any = slice(None)
+    ) -> Grants:
+        """Return the grants for requests (l, R) of the R ``runs``."""
+        queue = state.queue[:, runs]
+        if self.access in ("round_robin", "random"):
+            requests = requests & state.admitted[:, runs]
+        if self.access == "single":
+            requests = first_request(requests, queue)
+        return self.bucket.grant(state.tokens[runs], requests, queue)
+
+    def deliver(
+        self, state: NetworkState, requests: NDArray[np.bool_], reads_silence: bool = False
+    ) -> tuple[NetworkState, Delivery]:
+        """Return the state after the requests of a step, and what is delivered.
+
+        Args:
+            state: State before the requests.
+            requests: Sensors (l, N) bool.
+            reads_silence: Whether the reception has what silence may mean.
+        """
+        granted, spent, tokens, queue = self.grant(state, requests)
+        left = granted if state.lost is None else granted & ~state.lost
+        reception, due = Reception(left), state.due
+        if due is not None and state.delay is not None:
+            due = np.concatenate(((left * state.delay)[None], due[:-1]))
+            reception = Reception(left & (state.delay == 0))
+        if reads_silence:
+            before = state.tokens if self.bucket.sharing == "equal" else state.tokens - spent
+            possible = state.admitted & self.bucket.affordable(before)
+            if self.access == "single":
+                possible = possible & ~granted.any(0)
+            arrival = self.arrival_probability(state)
+            failure = None if arrival is None else 1.0 - arrival
+            reception = reception._replace(possible=possible, failure=failure)
+        moved = NetworkState(tokens, queue, state.admitted, state.channel, state.following, due=due)
+        return moved, Delivery(granted, spent, reception)
+
+    def late(self, state: NetworkState) -> NDArray[np.bool_] | None:
+        """Return the packets (D, l, N) of 1, …, D steps ago that arrive now; ``None`` if never.
+
+        Args:
+            state: State after :meth:`deliver`, before the next step.
+        """
+        steps = np.arange(1, self._longest + 1)
+        return None if state.due is None else state.due == steps[:, None, None]
+
+    def arrival_probability(self, state: NetworkState) -> Array | None:
+        """Return the probability (l, N) that a packet sent now arrives now; ``None`` is 1.
+
+        It follows from the channels' state that was fed back.
+
+        Args:
+            state: State before the requests.
+        """
+        if not self._loses and not self._longest:
+            return None
+        arrival: Any = np.ones(state.queue.shape)
+        if self.channel is not None and state.channel is not None:
+            sensor = np.arange(self.sensors)[:, None]
+            loss = namespace(state.channel).asarray(self.channel.transition @ self.channel.drop)
+            arrival = 1.0 - loss[state.channel, sensor]
+        elif self.channel is not None:
+            arrival = arrival - self.channel.drop[0][:, None]
+        return self.delay[0] * arrival if self._longest else arrival
