@@ -289,7 +289,6 @@ CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
         (TOBIT, CENTRE, "rollout:base=never", ("information = 'centre'",)),
         (TOBIT, {}, f"{VALUE}:threshold=0.1,price=0.1", ("price = 0.1", "with threshold")),
         (TOBIT, {}, f"{VALUE}:own=true,at_most=2", ("at_most = 2", "own=True")),
-        (TOBIT, {}, f"{VALUE}:own=true,steps=2", ("steps = 2", "own=True")),
         (TOBIT, {}, "estimate_difference:own=true,at_most=2", ("at_most = 2", "own=True")),
         (TOBIT, {}, "kullback_leibler:own=true,at_most=3", ("at_most = 3", "own=True")),
         (TOBIT, CENTRE, VALUE, ("information = 'centre'",)),

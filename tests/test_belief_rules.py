@@ -115,32 +115,7 @@ class Tied:
     """Beliefs by which all transmissions are worth the same."""
 
     def __init__(self, task: Task) -> None:
-        self.task = task
-
-    def value(self, steps: int = 1) -> Array:
-        """One."""
-        return np.ones((self.task.sensors, 2))
-
-
-def test_steps_ahead_sum_what_is_left_of_the_difference() -> None:
-    """Without noise and transmissions every estimate is moved by the plant alone."""
-    task = task_of(memory=True, filter="kalman", censoring_threshold=-np.inf)
-    batch = later(task)
-    matrix = np.array(task.plant.dynamics.transition)[..., 0]  # type: ignore[attr-defined]
-    best = after(task, batch.memory.states["every"], 0, 1, 2)[0]
-    total = np.zeros((4, batch.num_envs))
-    centres = [
-        after(task, batch.state.estimate)[0],
-        *(after(task, batch.state.estimate, s)[0] for s in range(3)),
-    ]
-    for power in range(3):
-        moved = np.linalg.matrix_power(matrix, power)
-        total += np.array([weighted(task, moved @ (best - centre)) for centre in centres])
-    value = total[0] - total[1:]
-    np.testing.assert_allclose(batch.beliefs().value(3), value, rtol=1e-9, atol=1e-12)
-    requests = ValueOfInformation(task, threshold=0.1, steps=3)(batch.signals())
-    share(requests)
-    np.testing.assert_array_equal(requests, value >= 0.1)
+        self.value = np.ones((task.sensors, 2))
 
 
 def test_what_differs_is_measured_in_the_states_unit_or_whitened() -> None:

@@ -136,11 +136,3 @@ def test_nodes_receive_by_default_what_the_papers_let_them_receive(
     assert task.broadcast == broadcast
     assert (task.memory, task.packet, task.memory_estimator) == (False, "measurement", None)
     assert not EpisodeBatch(task, 1).memory.states
-
-
-def test_a_single_sensor_looks_one_step_ahead() -> None:
-    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", filter="tobit", memory=True)
-    beliefs = EpisodeBatch.seeded(task, 2, 0, "own").beliefs()
-    for ask in (beliefs.loss, beliefs.value):
-        with pytest.raises(ValueError, match="steps = 2 is not allowed here: it must be 1"):
-            ask(2)

@@ -18,7 +18,7 @@ ENV = "fusion_gym/TobitOscillator-v1"
     ("options", "policies"),
     [
         ({}, ["innovation_threshold:threshold=0.5", "stochastic_event:weight=2", "always"]),
-        ({"memory": True}, ["value_of_information:threshold=0.01,steps=2", "value_of_information"]),
+        ({"memory": True}, ["value_of_information:threshold=0.01", "value_of_information"]),
         (
             {"memory": True},
             ["estimate_difference:own=true", "estimate_difference:own=true,whitened=true"],

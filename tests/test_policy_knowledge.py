@@ -220,7 +220,7 @@ LIARS: dict[str, tuple[Liar, str]] = {
     ),
     "plans_with_the_model": (Liar("centre", lambda s: s["estimate"].age), MEASUREMENTS),
     "believes_for_others": (
-        Liar("own_memory", lambda s: s["beliefs"].value(), "scheduler"),
+        Liar("own_memory", lambda s: s["beliefs"].value, "scheduler"),
         OTHERS,
     ),
     "is_shown_rows": (Liar("clock", lambda s: s["observation"].T[:2]), ANYTHING),

@@ -1,6 +1,7 @@
 """The priced threshold: the rules that it contains, its numbers, and who knows its scores."""
 
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ def scores(rule: PricedThreshold, batch: EpisodeBatch) -> tuple[Array, Array]:
     signals = batch.signals()
     if rule.score == "value":
         beliefs: Any = signals["own_beliefs" if rule.own else "beliefs"]
-        value, loss = beliefs.value(), beliefs.loss()
+        value, loss = beliefs.value, beliefs.loss
     elif rule.score == "variance":
         value, loss = signals["variance_reduction"], signals["silent_variance"]
     else:
@@ -120,13 +121,8 @@ def test_a_margin_holds_back_further_sensors() -> None:
     assert counts[1].sum() < counts[0].sum()
     np.testing.assert_array_equal(counts[2], np.minimum(counts[0], 1))
 
-    class Tied:
-        def value(self) -> Array:
-            return np.ones((3, 2))
-
-        loss = value
-
-    ages = {"age": np.array([[1.0, 4.0], [3.0, 4.0], [3.0, 2.0]]), "beliefs": Tied()}
+    tied = SimpleNamespace(value=np.ones((3, 2)), loss=np.ones((3, 2)))
+    ages = {"age": np.array([[1.0, 4.0], [3.0, 4.0], [3.0, 2.0]]), "beliefs": tied}
     single = {"tokens": np.ones(2), "price": np.ones(2)} | ages
     requests = PricedThreshold(task, threshold=0.5, margin=3.0)(Signals(single))
     np.testing.assert_array_equal(requests.T, [[False, True, False], [True, False, False]])
@@ -135,7 +131,7 @@ def test_a_margin_holds_back_further_sensors() -> None:
 def test_the_price_is_the_runs_own_where_it_is_drawn() -> None:
     task = task_of(memory=True, cost_weight="random", price_range=(0.005, 0.5))
     batch = later(task)
-    value, price = batch.beliefs().value(), batch.signals()["price"]
+    value, price = batch.beliefs().value, batch.signals()["price"]
     assert np.ptp(price) > 0.1
     requests = PricedThreshold(task, threshold=0.3)(batch.signals())
     share(requests)

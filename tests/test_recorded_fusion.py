@@ -130,7 +130,7 @@ def test_a_sensor_without_a_reading_does_nothing(tmp_path: Path) -> None:
         present = np.isfinite([readings[row.start + step] for row in rows_of(task, 30)]).T
         assert (batch.signals()["sampled"] == present).all()
         assert (batch.grantable() == present).all()
-        value = batch.beliefs().value()
+        value = batch.beliefs().value
         assert np.abs(value[~present]).max(initial=0.0) < 1e-9
         mean, covariance = task.estimator.single_deliveries(batch.state.estimate)
         silent = Parts.of(task).deliver(batch.state, np.zeros((2, 30), dtype=np.bool_)).estimate

@@ -105,3 +105,12 @@ def test_there_are_no_circles() -> None:
     for module in modules():
         for other in imports(module):
             assert module not in reached(other), f"{module} and {other} import each other"
+
+
+@pytest.mark.parametrize("package", ["core", "fusion", "systems"])
+def test_what_knows_no_environment_imports_no_gymnasium(package: str) -> None:
+    for path in (ROOT / "fusion_gym" / package).rglob("*.py"):
+        text = path.read_text()
+        assert "import gymnasium" not in text, path
+        assert "from gymnasium" not in text, path
+        assert package != "core" or len(text.splitlines()) <= 450, path

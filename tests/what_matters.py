@@ -36,20 +36,20 @@ class Believed:
     """Beliefs as plain arrays (…, N), so that some of them can be changed, beside the states that
     they were made of."""
 
-    parts = ("difference", "best", "silent", "sent")
+    parts = ("difference", "best", "silent", "sent", "value", "loss")
     states = ("memory_posterior", "memory_states")
 
     def __init__(self, values: Values, made_of: Values) -> None:
         self.values, self.made_of = values, made_of
 
     @classmethod
-    def from_beliefs(cls, beliefs: Any, steps: int) -> Believed:
-        """All that a policy may ask of beliefs, over so many steps."""
+    def from_beliefs(cls, beliefs: Any) -> Believed:
+        """All that a policy may ask of beliefs."""
         values = {name: getattr(beliefs, name) for name in cls.parts}
         made_of = {
             name: getattr(beliefs, name) for name in cls.states if beliefs.task.memory_estimator
         }
-        return cls(values | {"value": beliefs.value(steps), "loss": beliefs.loss(steps)}, made_of)
+        return cls(values, made_of)
 
     def with_each(self, change: Callable[..., Any], *others: Believed) -> Believed:
         """``change`` of every array, and of the others' of the same name."""
@@ -69,24 +69,13 @@ class Believed:
             return self.made_of.get(name, {})
         raise AttributeError(name)
 
-    def value(self, steps: int = 1) -> Any:
-        """As of the beliefs."""
-        return self.values["value"]
-
-    def loss(self, steps: int = 1) -> Any:
-        """As of the beliefs."""
-        return self.values["loss"]
-
 
 def read(signals: Signals, policy: Any) -> Values:
     """All signals; what is believed only for a policy that looks at it, for it takes long."""
     beliefs = ("beliefs", "own_beliefs", *(signal.name for signal in MEMORY_SIGNALS))
-    believes, steps = owner_of(policy) is not None, getattr(policy, "steps", 1)
+    believes = owner_of(policy) is not None
     result: Values = {name: signals[name] for name in signals if believes or name not in beliefs}
-    return {
-        n: Believed.from_beliefs(v, steps) if isinstance(v, Beliefs) else v
-        for n, v in result.items()
-    }
+    return {n: Believed.from_beliefs(v) if isinstance(v, Beliefs) else v for n, v in result.items()}
 
 
 def with_states(batch: EpisodeBatch, state: Any, memory: Memory) -> EpisodeBatch:

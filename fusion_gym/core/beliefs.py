@@ -123,32 +123,15 @@ class Beliefs(ABC):
         """x* - x̂ (k, n, N)."""
         return self.best.mean - self.silent.mean
 
-    def loss(self, steps: int = 1) -> Array:
-        """Return ‖x* - x̂‖² (k, N), weighted by ``task.relative_weights``.
-
-        Args:
-            steps: 1, or for the scheduler the number of steps over which the loss is summed.
-
-        Raises:
-            ValueError: ``steps`` exceeds 1 for an owner without a model of the centre.
-        """
-        _require_single_step(steps)
+    @cached_property
+    def loss(self) -> Array:
+        """‖x* - x̂‖² (k, N), weighted by ``task.relative_weights``."""
         return self._weighted(self.difference)
 
-    def value(self, steps: int = 1) -> Array:
-        """Return v(s) (sensors, N), weighted by ``task.relative_weights``.
-
-        Args:
-            steps: 1, or for the scheduler the number of steps over which the value is summed.
-
-        Raises:
-            ValueError: ``steps`` exceeds 1 for an owner without a model of the centre.
-        """
-        _require_single_step(steps)
-        return self._expected(self.loss(), self._weighted(self.best.mean - self.sent.mean))
-
-    def _expected(self, silent: Array, sent: Array) -> Array:
-        gain = silent - sent
+    @cached_property
+    def value(self) -> Array:
+        """v(s) (sensors, N), weighted by ``task.relative_weights``."""
+        gain = self.loss - self._weighted(self.best.mean - self.sent.mean)
         return gain if self.arrival is None else self.arrival * gain
 
     def _weighted(self, difference: Array) -> Array:
@@ -194,26 +177,6 @@ class SchedulerBeliefs(Beliefs):
         assert self.task.memory_estimator is not None
         return self.update(self.task.memory_estimator, self.memory_states["every"], everyone)
 
-    def loss(self, steps: int = 1) -> Array:
-        """Return ‖x* - x̂‖² (1, N), summed over ``steps`` steps without noise and transmissions."""
-        if steps == 1:
-            return super().loss()
-        apart = self._path(self._silent, steps) - self._best_path(steps)
-        return linalg.total(self._weighted(apart))[None]
-
-    def value(self, steps: int = 1) -> Array:
-        """Return v(s) (sensors, N), summed over ``steps`` steps without noise and transmissions."""
-        if steps == 1:
-            return super().value()
-        best = self._best_path(steps)
-        if self.task.packet == "estimate":
-            left = np.zeros((self.task.sensors, self._runs))
-        else:
-            left = np.stack(
-                [linalg.total(self._weighted(self._path(s, steps) - best)) for s in self._sent]
-            )
-        return self._expected(self.loss(steps), left)
-
     @cached_property
     def _silent(self) -> Any:
         return self.update(self.task.estimator, self._estimate, self._no_packets(self._runs))
@@ -227,14 +190,6 @@ class SchedulerBeliefs(Beliefs):
             single[sensor] = True
             result.append(self.update(self.task.estimator, self._estimate, single))
         return result
-
-    def _best_path(self, steps: int) -> Array:
-        return silent_path(
-            self.task.memory_estimator or self.task.estimator, self.memory_posterior, steps
-        )
-
-    def _path(self, updated: Any, steps: int) -> Array:
-        return silent_path(self.task.estimator, updated, steps)
 
 
 class OwnBeliefs(Beliefs):
@@ -298,28 +253,6 @@ class OwnBeliefs(Beliefs):
             return np.moveaxis(values.reshape(*values.shape[:-1], *shape), -2, 0)
 
         return Estimate(apart(whole.mean[0]), lambda: apart(whole.covariance[0]))
-
-
-def _require_single_step(steps: int) -> None:
-    if steps != 1:
-        raise ValueError(
-            f"steps = {steps} is not allowed here: it must be 1, because a local sensor cannot "
-            "predict the centre's estimate over several steps"
-        )
-
-
-def silent_path(estimator: Estimator[Any], updated: Any, steps: int) -> Array:
-    """Return fused means (steps, n, N) without measurements and transmissions."""
-    means = [estimator.mean(updated)]
-    silence = None
-    for _ in range(steps - 1):
-        predicted = estimator.predict(updated)
-        if silence is None:
-            shape = len(predicted.measurement), means[0].shape[-1]
-            silence = Reception(np.zeros(shape, dtype=np.bool_))
-        updated = estimator.update(predicted, silence)
-        means.append(estimator.mean(updated))
-    return np.stack(means)
 
 
 def _fused(estimator: Estimator[Any], updated: Any) -> Estimate:

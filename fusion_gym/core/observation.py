@@ -112,8 +112,8 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         return np.arcsinh(_DIFFERENCE * beliefs.difference / deviation)
 
     def value(beliefs: Beliefs) -> Array:
-        silent = np.broadcast_to(beliefs.loss(), (task.sensors, beliefs.loss().shape[-1]))
-        both = np.stack((silent, beliefs.value()), axis=1) / whole
+        silent = np.broadcast_to(beliefs.loss, (task.sensors, beliefs.loss.shape[-1]))
+        both = np.stack((silent, beliefs.value), axis=1) / whole
         return _VALUE * np.sign(both) * np.sqrt(np.abs(both))
 
     states, nodes = task.plant.state_names, numbered(task.sensors)

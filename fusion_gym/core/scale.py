@@ -138,7 +138,7 @@ def _sweep(task: Task) -> tuple[Array, Array]:
     batch = _batch(task, runs, len(levels) * len(counts))
     total = np.zeros((2, len(most)))
     for _ in range(batch.task.horizon):
-        value = task.error_scale * batch.beliefs().value()
+        value = task.error_scale * batch.beliefs().value
         rank = np.argsort(np.argsort(-value, axis=0), axis=0)
         outcome = batch.step((value >= least) & (rank < most))
         total += outcome.cost, -outcome.reward_error

@@ -46,9 +46,9 @@ _EVERY = ("beliefs", "belief_difference", "transmission_value")
 def memory_signals(owner: Owner, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
     """Return the owner's beliefs and ``MEMORY_SIGNALS`` by name, as functions."""
     if owner == "own":
-        values = (beliefs, lambda: beliefs().difference, lambda: beliefs().value())
+        values = (beliefs, lambda: beliefs().difference, lambda: beliefs().value)
         return dict(zip(_OWN, values, strict=True))
-    values = (beliefs, lambda: beliefs().difference[0], lambda: beliefs().value())
+    values = (beliefs, lambda: beliefs().difference[0], lambda: beliefs().value)
     return dict(zip(_EVERY, values, strict=True))
 
 

@@ -1,6 +1,5 @@
 """Run several policies on the same episodes in one batch, for searches over many parameters."""
 
-import functools
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Estimate, Owner
+from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, decide, guard, owner_of
@@ -140,7 +139,7 @@ class _Whole:
 
     def __init__(self, signals: Signals) -> None:
         self._signals = signals
-        self._beliefs: dict[str, _Once] = {}
+        self._beliefs: dict[str, Beliefs] = {}
 
     def part(self, runs: Runs) -> Signals:
         """Return the signals of some runs; each is computed at its first use."""
@@ -154,7 +153,7 @@ class _Whole:
             return _Part(self._beliefs[name], runs)
         value: Any = self._signals[name]
         if isinstance(value, Beliefs):
-            self._beliefs[name] = _Once(value)
+            self._beliefs[name] = value
             return _Part(self._beliefs[name], runs)
         if name == "token_cost":  # the same for all runs
             return value
@@ -163,41 +162,18 @@ class _Whole:
         return take_runs(value, runs)
 
 
-class _Once:
-    """Beliefs of all runs, whose sums over several steps are computed once for all policies."""
-
-    def __init__(self, beliefs: Beliefs) -> None:
-        self.beliefs = beliefs
-        self.loss = functools.cache(beliefs.loss)
-        self.value = functools.cache(beliefs.value)
+def _of_runs(name: str) -> Any:
+    return property(lambda part: take_runs(getattr(part._whole, name), part._choices))
 
 
 class _Part(Beliefs):
     """The beliefs of some runs."""
 
-    def __init__(self, whole: _Once, runs: Runs) -> None:
-        self.task, self.memory_states = whole.beliefs.task, whole.beliefs.memory_states
+    silent, sent, best = _of_runs("silent"), _of_runs("sent"), _of_runs("best")
+    memory_posterior = _of_runs("memory_posterior")
+    loss, value = _of_runs("loss"), _of_runs("value")
+
+    def __init__(self, whole: Beliefs, runs: Runs) -> None:
+        self.task, self.memory_states = whole.task, whole.memory_states
+        self.arrival = take_runs(whole.arrival, runs)
         self._whole, self._choices = whole, runs
-        self.arrival = take_runs(whole.beliefs.arrival, runs)
-
-    @property
-    def silent(self) -> Estimate:
-        return take_runs(self._whole.beliefs.silent, self._choices)
-
-    @property
-    def sent(self) -> Estimate:
-        return take_runs(self._whole.beliefs.sent, self._choices)
-
-    @property
-    def best(self) -> Estimate:
-        return take_runs(self._whole.beliefs.best, self._choices)
-
-    @property
-    def memory_posterior(self) -> Any:
-        return take_runs(self._whole.beliefs.memory_posterior, self._choices)
-
-    def loss(self, steps: int = 1) -> Array:
-        return np.asarray(take_runs(self._whole.loss(steps), self._choices))
-
-    def value(self, steps: int = 1) -> Array:
-        return np.asarray(take_runs(self._whole.value(steps), self._choices))

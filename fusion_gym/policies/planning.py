@@ -1,13 +1,13 @@
 """The planning model of a reference policy: the task's model without hidden quantities."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.beliefs import silent_path
-from fusion_gym.core.estimator import Reception
+from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.network import NetworkState
 from fusion_gym.core.task import Task
@@ -69,11 +69,25 @@ class PlanningModel:
         if self._task.packet == "estimate" and self._beliefs is not None:
             mean, covariance = self._beliefs.best
             updated = estimator.adopt(updated, mean[0], covariance[0], np.asarray(arriving.any(0)))
-        return silent_path(estimator, updated, steps)
+        return _silent_path(estimator, updated, steps)
 
     def best_means(self, steps: int) -> Array:
         """Return the predicted means (steps, n, N) of the best estimate, from all measurements."""
         estimator = self._task.memory_estimator
         if estimator is None or self._beliefs is None:
             return self.fused_means(np.ones((self._task.sensors, self.runs), np.bool_), steps)
-        return silent_path(estimator, self._beliefs.memory_posterior, steps)
+        return _silent_path(estimator, self._beliefs.memory_posterior, steps)
+
+
+def _silent_path(estimator: Estimator[Any], updated: Any, steps: int) -> Array:
+    """Return fused means (steps, n, N) without measurements and transmissions."""
+    means = [estimator.mean(updated)]
+    silence = None
+    for _ in range(steps - 1):
+        predicted = estimator.predict(updated)
+        if silence is None:
+            shape = len(predicted.measurement), means[0].shape[-1]
+            silence = Reception(np.zeros(shape, dtype=np.bool_))
+        updated = estimator.update(predicted, silence)
+        means.append(estimator.mean(updated))
+    return np.stack(means)

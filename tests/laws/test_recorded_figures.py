@@ -62,7 +62,7 @@ def figures_of(case: Case, owner: Owner | None) -> Figures:
         if owner is not None:
             beliefs = batch.beliefs()
             add("difference of beliefs", step, beliefs.difference)
-            add("value of a transmission", step, beliefs.value())
+            add("value of a transmission", step, beliefs.value)
         result = batch.step(request)
         add("reward", step, result.reward)
         add("squared error", step, result.squared_error)

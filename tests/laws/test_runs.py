@@ -105,7 +105,7 @@ def contents(runs: Any) -> list[bytes]:
         runs.admitted(),
         runs.state.network.queue,
     ]
-    observation += [runs.beliefs().best.mean, runs.beliefs().value()]
+    observation += [runs.beliefs().best.mean, runs.beliefs().value]
     return [np.ascontiguousarray(part).tobytes() for part in observation]
 
 

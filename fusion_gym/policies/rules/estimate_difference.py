@@ -61,11 +61,11 @@ class EstimateDifference(BeliefRule):
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         beliefs, age = self.beliefs(signals), signals["age"]
-        squared = _whitened(beliefs) if self.whitened else beliefs.loss()
+        squared = _whitened(beliefs) if self.whitened else beliefs.loss
         requests = np.broadcast_to(squared >= self.threshold * self.threshold, age.shape)
         if self.own or self.at_most is None:
             return requests.copy()
-        return strongest(beliefs.value(), requests, self.at_most, age)
+        return strongest(beliefs.value, requests, self.at_most, age)
 
 
 def _whitened(beliefs: Beliefs) -> Array:

@@ -156,4 +156,4 @@ class PricedThreshold(BeliefRule):
         if self.score == "variance":
             return signals["variance_reduction"], signals["silent_variance"]
         beliefs = self.beliefs(signals)
-        return beliefs.value(), beliefs.loss()
+        return beliefs.value, beliefs.loss

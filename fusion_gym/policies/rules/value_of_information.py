@@ -1,11 +1,9 @@
 """Transmit a packet whose expected improvement of the estimate exceeds a price or threshold."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from fusion_gym import validation
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.errors import forbidden
 from fusion_gym.policies.base import Requests, check_at_most, check_price, parameter, strongest
@@ -27,12 +25,10 @@ class ValueOfInformation(BeliefRule):
         threshold: θ >= 0, in squared units of the states; 0.03 without a price.
         price: price of a token in the reward's units, instead of the threshold.
         at_most: most requests in a step, by the highest value; None for no limit.
-        steps: steps ahead over which the distances are summed, without noise and further
-            transmissions.
 
     Raises:
-        ConfigurationError: both thresholds, a value that is not allowed, ``at_most`` or ``steps``
-            with ``own``, or a task whose policies do not see the sensors.
+        ConfigurationError: both thresholds, a value that is not allowed, ``at_most`` with
+            ``own``, or a task whose policies do not see the sensors.
 
     Equation:
         $$
@@ -44,11 +40,9 @@ class ValueOfInformation(BeliefRule):
         after a transmission of s only; the expectation is over the packet's arrival. W are the
         reward's weights with mean 1, θ is ``threshold``. With ``price`` p instead, v in the
         reward's units must reach p times the tokens of the transmission. With ``at_most``, the
-        sensors of the highest value are requested; with ``steps`` h the squares are summed over h
-        steps ahead.
+        sensors of the highest value are requested.
 
-    Assumes: x* is the conditional mean given the knowledge of its owner, and only the next
-    ``steps`` steps count.
+    Assumes: x* is the conditional mean given the knowledge of its owner, and only this step counts.
 
     Sources: :mod:`fusion_gym.core.beliefs` lists them.
 
@@ -59,8 +53,6 @@ class ValueOfInformation(BeliefRule):
     threshold: float | None = parameter(None, check_price)
     price: float | None = parameter(None, check_price)
     at_most: int | None = parameter(None, check_at_most)
-    steps: int = parameter(1, validation.integer, at_least=1, at_most=validation.MOST_STEPS)
-    together: ClassVar[tuple[str, ...]] = ("at_most", "steps")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,7 +62,7 @@ class ValueOfInformation(BeliefRule):
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
-        value = self.beliefs(signals).value(self.steps)
+        value = self.beliefs(signals).value
         if self.price is None:
             least = np.asarray(0.03 if self.threshold is None else self.threshold)
         else:

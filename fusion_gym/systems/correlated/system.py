@@ -100,7 +100,8 @@ class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
         actual, r = np.sqrt(state.scale) * noise, self.dynamics.noise_channels
         process, own = true_noise(state.departure, actual[:r], actual[r:])
         truth = self.dynamics.advance(state.truth, process, state.departure)
-        return replace(state, truth=truth, measurement=self.sensors.measure(truth, process, own))
+        measurement = self.sensors.measure(truth, process, own)
+        return CorrelatedTrackingTruth(truth, state.scale, measurement, state.departure)
 
     @property
     def draw_channels(self) -> int:

@@ -79,7 +79,7 @@ class ScalarSources(Plant[SourceTruth]):
         a, sigma = self.coefficient[:, None], self.deviation[:, None]
         moved = true_motion(state.departure, np.zeros(1), a * state.truth)
         drawn = true_noise(state.departure, noise, noise[:0])[0]
-        return replace(state, truth=moved + sigma * drawn)
+        return SourceTruth(moved + sigma * drawn, state.departure)
 
     def measurement(self, state: SourceTruth) -> Array:
         """Return the values (n, 1, N)."""

@@ -161,57 +161,47 @@ class RecordedEstimator(CensoredEstimator):
             for block in super().observation
         )
 
-    def start(self, measurement: Array, announcement: Any) -> RecordedEstimate:
+    def start(self, measurement: Array, announcement: Any) -> Any:
         """See :class:`Estimator`; a gap is filled with the expectation."""
         mean, day = announcement
         plain = replace(self, known_start=False)
         first = CensoredEstimator.start(plain, measurement, mean)
-        start = RecordedEstimate(**_values(first), day=day)
-        prior = start.prior_mean, start.prior_covariance
-        start.prediction = self.centre.predict(*prior, np.nan_to_num(measurement), start.time)
-        state = self.observe(start, measurement)
-        state.prediction = self.centre.predict(*prior, state.measurement, state.time)
-        everyone = np.ones(state.age.shape, dtype=np.bool_)
-        result = self.update(replace(state, held=state.measurement), Reception(everyone))
+        prior, time = (first.prior_mean, first.prior_covariance), first.time
+        first.prediction = self.centre.predict(*prior, np.nan_to_num(measurement), time)
+        state = self.observe(RecordedEstimate(**_values(first), day=day), measurement)
+        prediction = self.centre.predict(*prior, state.measurement, time)
+        state = replace(state, held=state.measurement, prediction=prediction)
+        result = self.update(state, Reception(np.ones(state.age.shape, dtype=np.bool_)))
         return replace(result, prediction=None, age=np.zeros_like(state.age))
 
-    def predict(self, state: CensoredEstimate) -> RecordedEstimate:
+    def predict(self, state: Any) -> Any:
         """See :class:`Estimator`; held readings stay while the level moves."""
-        assert isinstance(state, RecordedEstimate)
         moved = self._level(state, state.time + 1.0) - self._level(state, state.time)
-        result = super().predict(replace(state, held=state.held - moved))
-        assert isinstance(result, RecordedEstimate)
-        return result
+        return super().predict(replace(state, held=state.held - moved))
 
-    def observe(self, state: CensoredEstimate, measurement: Array) -> RecordedEstimate:
+    def observe(self, state: Any, measurement: Array) -> Any:
         """See :class:`Estimator`; a sensor without a reading has the expectation."""
-        assert isinstance(state, RecordedEstimate)
         available = np.isfinite(measurement[:, 0])
         expected = sensed(state.prediction).expectation.value
         filled = np.where(available[:, None], measurement, expected)
         return replace(state, measurement=filled, available=available)
 
-    def update(self, state: CensoredEstimate, reception: Reception) -> RecordedEstimate:
+    def update(self, state: Any, reception: Reception) -> Any:
         """See :class:`Estimator`; a sensor without a reading delivers nothing."""
-        assert isinstance(state, RecordedEstimate)
         arrived = reception.arrived & state.available
-        result = super().update(state, reception._replace(arrived=arrived))
-        assert isinstance(result, RecordedEstimate)
-        return result
+        return super().update(state, reception._replace(arrived=arrived))
 
-    def single_deliveries(self, state: CensoredEstimate) -> tuple[Array, Array] | None:
+    def single_deliveries(self, state: Any) -> tuple[Array, Array] | None:
         """See :class:`Estimator`."""
         single = super().single_deliveries(state)
         if single is None:
             return None
-        assert isinstance(state, RecordedEstimate)
         silence = Reception(np.zeros_like(state.available))
         silent = self.update(state, silence).covariance
         return single[0], np.where(state.available[:, None, None], single[1], silent)
 
-    def read(self, state: CensoredEstimate, failure: Array | None = None) -> SignalValues:
+    def read(self, state: Any, failure: Array | None = None) -> SignalValues:
         """Return the signals, measurements as readings."""
-        assert isinstance(state, RecordedEstimate)
         signals, level = dict(super().read(state, failure)), self._level(state, state.time)
         for name in ("measurement", "held", "expected_measurement"):
             signals[name] = np.asarray(signals[name]) + level
