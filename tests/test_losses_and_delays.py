@@ -166,6 +166,8 @@ def test_a_network_refuses_what_it_does_not_model() -> None:
     task = make_task("LinearFusion-v2", {}, 0.2, DELAY)
     with pytest.raises(ConfigurationError, match=r"delay = .* sum to 1"):
         Network(task.network.bucket, delay=(0.5, 0.2))
+    with pytest.raises(ConfigurationError, match=r"channel = .* each of the 2 sensors"):
+        Network(task.network.bucket, channel=Channel.independent(0.1, 3))
     with pytest.raises(ConfigurationError, match="access = 'each'"):
         Network(task.network.bucket, access="each")
     with pytest.raises(ConfigurationError, match=r"delay = .*memory of local sensors"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,7 +64,8 @@ class Network:
         delay: Probabilities of a delay of 0, 1, … steps, drawn for each packet.
 
     Raises:
-        ConfigurationError: The rule is unknown, or the probabilities do not sum to 1.
+        ConfigurationError: The rule is unknown, the probabilities do not sum to 1, or the channel
+            has another number of sensors.
 
     Example:
         >>> from fusion_gym.core.network import Network
@@ -77,13 +78,16 @@ class Network:
     bucket: TokenBucket
     access: str = "any"
     channel: Channel | None = None
-    delay: tuple[float, ...] = field(default=(1.0,))
+    delay: tuple[float, ...] = (1.0,)
 
     def __post_init__(self) -> None:
         validation.choice("access", self.access, ACCESS_RULES)
         law = validation.not_negative("delay", self.delay, (len(self.delay),))
         if abs(law.sum() - 1.0) > 1e-9:
             raise forbidden("delay", self.delay, "it must have probabilities that sum to 1")
+        if self.channel is not None and self.channel.drop.shape[1] != self.sensors:
+            reason = f"it must have a loss for each of the {self.sensors} sensors"
+            raise forbidden("channel", self.channel.drop, reason)
 
     @property
     def sensors(self) -> int:

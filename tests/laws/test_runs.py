@@ -11,6 +11,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.envs.single import FusionEnv
+from fusion_gym.systems.markov_jump.system import MarkovJumpEstimator
 
 RUNS, STEPS = 4, 6
 
@@ -155,7 +156,7 @@ CONSTANT: dict[str, Callable[[EpisodeBatch, Signals], Array]] = {
     "difference": lambda b, s: s["measurement"] - s["held"],
     "error": lambda b, s: s["innovation"],
 }
-DIFFERING = {"whitened_innovation": "MarkovJumpEstimator"}  # that of the node, not of the packet
+DIFFERING = {"whitened_innovation": MarkovJumpEstimator}  # that of the node, not of the packet
 
 
 def place(price: Array, low: float, high: float) -> Array:
@@ -167,7 +168,7 @@ def place(price: Array, low: float, high: float) -> Array:
 def test_blocks_that_every_system_may_have_mean_the_same(case: Case) -> None:
     batch, result = case.batch(RUNS), 0
     ratios: dict[str, list[Array]] = {}
-    kind = type(batch.task.estimator).__name__
+    kind = type(batch.task.estimator)
     for request in requests(batch.task, RUNS, STEPS):
         observation, signals, first = batch.observe(), read(batch), 0
         for block in batch.layout.blocks:

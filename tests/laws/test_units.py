@@ -11,6 +11,10 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.task import Task
+from fusion_gym.systems.correlated.system import CorrelatedTrackingPlant
+from fusion_gym.systems.remote.system import ScalarSources
+from fusion_gym.systems.tobit.system import CensoredPlant
+from fusion_gym.systems.unknown_input.system import DrivenPlant
 
 RUNS, STEPS = 5, 12
 # Of the largest error; covariance intersection stops near its optimum, matrix weights have a ridge.
@@ -190,16 +194,16 @@ def exchanged(before: Task, after: Task, order: Array) -> Channels:
     """The noise with which sensors in another order measure the same."""
     plant: Any = before.plant
     steps, starts, sources = plant.noise_channels, plant.start_channels, before.sensors
-    match type(plant).__name__:
-        case "CensoredPlant":
+    match plant:
+        case CensoredPlant():
             own = sources * plant.sensors.size
             start, step = [(2 * plant.dynamics.size, own)], [(steps - own, own)]
-        case "CorrelatedTrackingPlant":
+        case CorrelatedTrackingPlant():
             start, step = [], [(steps - 2 * sources, 2 * sources)]
-        case "DrivenPlant":
+        case DrivenPlant():
             size = plant.dynamics.size
             start, step = [(size, 2 * sources)], [(steps - 2 * sources, 2 * sources)]
-        case "ScalarSources":
+        case ScalarSources():
             start, step = [(0, sources)], [(0, sources)]
         case _:  # fading, then noises
             start, step = [], [(steps - 2 * sources, sources), (steps - sources, sources)]
