@@ -18,7 +18,7 @@ SignalValues = Mapping[str, SignalArray | Callable[[], SignalArray]]
 class Reception(NamedTuple):
     """The packets that arrive in a step, and what a silence may mean.
 
-    Attributes:
+    Args:
         arrived: Sensors (l, N) bool whose packet arrives.
         possible: Sensors (l, N) bool whose request the network would have granted; ``None`` is all.
         failure: Probability (l, N) that the network loses a granted packet; ``None`` is 0.
