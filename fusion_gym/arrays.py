@@ -1,7 +1,7 @@
 """Arrays of N runs with the batch axis last, and records of such arrays."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,40 +17,37 @@ def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
         state: Dataclasses, dictionaries and tuples of arrays (…, N), or functions that return them.
         runs: Numbers of the runs.
     """
-    if isinstance(state, np.ndarray):
-        return state.take(runs, axis=-1)
-    if state is None:
-        return None
-    if isinstance(state, tuple):
-        return _tuple_like(state, (take_runs(part, runs) for part in state))
-    if isinstance(state, dict):
-        return {name: take_runs(part, runs) for name, part in state.items()}
-    if callable(state):
-        return lambda: take_runs(state(), runs)
-    return type(state)(
-        *(take_runs(getattr(state, field.name), runs) for field in dataclasses.fields(state))
-    )
+    return _mapped(lambda array: array.take(runs, axis=-1), state)
 
 
 def merge_runs(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:
     """Return ``old`` with ``new`` in the given runs, through dataclasses and tuples."""
-    if isinstance(old, np.ndarray):
-        result = old.copy()
-        result[..., runs] = new
+
+    def merged(array: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
+        result = array.copy()
+        result[..., runs] = part
         return result
-    if old is None:
+
+    return _mapped(merged, old, new)
+
+
+def _mapped(function: Callable[..., Any], first: Any, *others: Any) -> Any:
+    """Return a state of the form of ``first``, with a function of the arrays in each place."""
+    if isinstance(first, np.ndarray):
+        return function(first, *others)
+    if first is None:
         return None
-    if isinstance(old, dict):
-        return {name: merge_runs(part, new[name], runs) for name, part in old.items()}
-    if isinstance(old, tuple):
-        return _tuple_like(old, (merge_runs(a, b, runs) for a, b in zip(old, new, strict=True)))
-    return type(old)(
-        *(
-            merge_runs(getattr(old, field.name), getattr(new, field.name), runs)
-            for field in dataclasses.fields(old)
-        )
-    )
-
-
-def _tuple_like(like: Any, parts: Iterable[Any]) -> Any:
-    return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
+    if isinstance(first, tuple):
+        parts = [_mapped(function, *each) for each in zip(first, *others, strict=True)]
+        return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
+    if isinstance(first, dict):
+        return {
+            name: _mapped(function, part, *(other[name] for other in others))
+            for name, part in first.items()
+        }
+    if callable(first):
+        return lambda: _mapped(function, first(), *(other() for other in others))
+    names = (field.name for field in dataclasses.fields(first))
+    states = (first, *others)
+    fields = ((getattr(state, name) for state in states) for name in names)
+    return type(first)(*(_mapped(function, *each) for each in fields))

@@ -99,8 +99,7 @@ def _beyond(z: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
 def density(z: ArrayLike) -> FloatArray:
     """Return the standard normal density ``phi(z) = exp(-z^2 / 2) / sqrt(2 pi)``."""
     values = as_array(z)
-    result: FloatArray = _DENSITY_SCALE * namespace(values).exp(-0.5 * values * values)
-    return result
+    return _DENSITY_SCALE * namespace(values).exp(-0.5 * values * values)
 
 
 @np.errstate(all="ignore")

@@ -93,7 +93,7 @@ class FunctionalEnv:
         price = task.reward.price.fixed
         self.default_params = EnvParams(price)
         if isinstance(estimator, CensoredEstimator):
-            shares = getattr(getattr(estimator.centre, "feedback", None), "share", None)
+            shares = getattr(estimator.centre, "share", None)
             self.default_params = EnvParams(
                 price,
                 estimator.model.process_covariance[..., 0],

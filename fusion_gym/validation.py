@@ -127,9 +127,8 @@ def number(
 def integer(field: str, value: Any, *, at_least: int, at_most: int | None = None) -> int:
     """Return a whole number within the limits; ``True``, 2.0 and "2" are not allowed."""
     allowed = f"a whole number >= {at_least}" + ("" if at_most is None else f" and <= {at_most}")
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise refusal(field, value, allowed)
-    if value < at_least or (at_most is not None and value > at_most):
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or value < at_least or (at_most is not None and value > at_most):
         raise refusal(field, value, allowed)
     return int(value)
 

@@ -217,7 +217,7 @@ def test_prices_are_slopes_of_the_front(monkeypatch: pytest.MonkeyPatch) -> None
         for value in np.geomspace(0.01, 1.0, 200).tolist()
     ]
     always = type("Brief", (), {"tokens": np.ones(3)})
-    monkeypatch.setattr(rules, "run_policies", lambda *_: [always])
+    monkeypatch.setattr(rules, "run_episodes", lambda *_: always)
     monkeypatch.setattr(rules, "make_policy", lambda *_: None)
     shares = (0.5, 0.25, 0.12, 0.06, 0.03)
     job = rules.SweepJob(load_suite().settings[0], "scheduler", (), shares, (3, 3))

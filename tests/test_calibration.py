@@ -15,8 +15,7 @@ from training_configs import small_config
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.policy_batch import run_priced
+from fusion_gym.evaluation.episodes import run_episodes, run_priced
 from fusion_gym.policies.calibrated import (
     CalibratedPolicy,
     CalibrationPoint,

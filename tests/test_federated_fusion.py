@@ -9,7 +9,7 @@ from parts import Parts
 
 from fusion_gym import ConfigurationError
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.centre import FederatedCentre, Feedback
+from fusion_gym.systems.tobit.centre import FederatedCentre, information_shares
 from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
@@ -26,7 +26,7 @@ def make_parts(kind: Any, share: Any) -> Parts:
     """Uncensored sensors that all differ, and a process covariance without an inverse."""
     dynamics = LinearPlant.create(TRANSITION, PROCESS, [2.0, -1.0], 0.4 * np.eye(2))
     sensors = CensoredSensors.create(MATRICES, VARIANCES, -np.inf, 2)
-    centre = FederatedCentre(kind(sensors), Feedback.in_shares(share, 3))
+    centre = FederatedCentre(kind(sensors), information_shares(share, 3))
     names, ones = ("x1", "x2"), np.ones(2)
     plant = CensoredPlant(dynamics, sensors, names)
     return Parts(plant, CensoredEstimator(dynamics, centre, names, scale=ones, reference=ones))
@@ -74,7 +74,7 @@ def test_uncensored_federation_is_the_centralised_kalman_filter(
 )
 def test_bad_shares_are_refused(share: Any, reason: str) -> None:
     with pytest.raises(ConfigurationError) as refused:
-        Feedback.in_shares(share, 3)
+        information_shares(share, 3)
     message = str(refused.value)
     assert message.startswith("information_shares = ")
     assert reason in message

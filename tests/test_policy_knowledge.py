@@ -30,7 +30,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.docstrings import read
 from fusion_gym.evaluation import record_episode, run_episodes, watch
 from fusion_gym.evaluation.cross_term import cross_terms
-from fusion_gym.evaluation.policy_batch import run_policies, run_priced
+from fusion_gym.evaluation.episodes import run_priced, run_several
 from fusion_gym.policies.base import Rule
 from fusion_gym.policies.belief_rule import BeliefRule
 from fusion_gym.policies.registry import make_policy, policy_maker, policy_names, register_policy
@@ -235,7 +235,7 @@ def loops(task: Task, policy: Any) -> dict[str, Callable[[], Any]]:
         "episodes": lambda: run_episodes(task, policy, 2, 0),
         "record": lambda: record_episode(task, policy, 0),
         "search": lambda: run_priced(task, policy, np.arange(2), np.ones(2)),
-        "several": lambda: run_policies(task, [policy, policy], 2, 0),
+        "several": lambda: run_several(task, [policy, policy], 2, 0),
         "cross term": lambda: cross_terms(task, task.estimator, {"policy": policy}, 2, 0),
         "watch": lambda: list(watch(task, {"policy": policy}, steps=1)),
         "papers": lambda: next(walk(task, policy, 2, 0)),

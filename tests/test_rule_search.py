@@ -11,8 +11,7 @@ import pytest
 import fusion_gym
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import rule_search
-from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.policy_batch import EpisodeMeans, run_policies, run_priced
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced, run_several
 from fusion_gym.evaluation.rule_search import (
     Generation,
     RuleSearch,
@@ -41,13 +40,18 @@ def small(**changes: Any) -> RuleSearch:
     return RuleSearch(task_of(), PRICES, **(options | changes))
 
 
+def means_of(error_cost: Any, tokens: Any) -> EpisodeResults:
+    others = {field.name: error_cost for field in dataclasses.fields(EpisodeResults)}
+    return EpisodeResults(**others | {"tokens": tokens})
+
+
 def test_costs_beside_each_other_are_those_of_episodes() -> None:
     task, text = task_of(), "priced_threshold:threshold=0.3"
     rules = [f"{text},price={price}" for price in PRICES]
     seeds = np.tile(np.arange(5, 11), 3)
     prices = np.repeat(PRICES, 6)
     priced = run_priced(task, make_policy(text, task), seeds, prices)
-    briefs = run_policies(task, [make_policy(rule, task) for rule in rules], 6, 5)
+    briefs = run_several(task, [make_policy(rule, task) for rule in rules], 6, 5)
     for place, (rule, price, brief) in enumerate(zip(rules, PRICES, briefs, strict=True)):
         single = run_episodes(task, make_policy(rule, task), 6, 5)
         np.testing.assert_array_equal(brief.error_cost, single.error_cost)
@@ -101,14 +105,18 @@ def seeds(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
     """The seeds of every batch of a search, whose episodes are not run."""
     batches: list[set[int]] = []
 
-    def means(seeds: Any) -> EpisodeMeans:
+    def means(seeds: Any) -> EpisodeResults:
         batches.append(set(np.asarray(seeds).tolist()))
-        return EpisodeMeans(*np.ones((4, len(seeds))))
+        return means_of(np.ones(len(seeds)), np.ones(len(seeds)))
 
-    def policies(task: Task, rules: Any, episodes: int, seed: int) -> list[EpisodeMeans]:
-        return [means(seed + np.arange(episodes))] * len(rules)
+    def policy(task: Task, rule: Any, episodes: int, seed: int) -> EpisodeResults:
+        return means(seed + np.arange(episodes))
 
-    monkeypatch.setattr(rule_search, "run_policies", policies)
+    def policies(task: Task, rules: Any, episodes: int, seed: int) -> list[EpisodeResults]:
+        return [policy(task, None, episodes, seed)] * len(rules)
+
+    monkeypatch.setattr(rule_search, "run_episodes", policy)
+    monkeypatch.setattr(rule_search, "run_several", policies)
     monkeypatch.setattr(rule_search, "run_priced", lambda task, policy, seeds, prices: means(seeds))
     return batches
 
@@ -137,11 +145,11 @@ def test_a_cost_without_number_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> 
     singles = [ThresholdTrial("", 1.0, 10.0, error) for error in (0.9, 1.0, 0.0)]
     search.__dict__["start"] = tuple(singles)  # at the prices .01, .1, 1 they cost 1, 2, 10
 
-    def run(task: Task, policy: Any, seeds: Any, prices: Any) -> EpisodeMeans:
+    def run(task: Task, policy: Any, seeds: Any, prices: Any) -> EpisodeResults:
         error = np.ones(len(seeds))
         error[policy.numbers.margin[0] > 5.0] = np.nan
         error[policy.numbers.margin[0] < 0.5] = np.inf
-        return EpisodeMeans(error, error, error, np.zeros(len(seeds)))
+        return means_of(error, np.zeros(len(seeds)))
 
     monkeypatch.setattr(rule_search, "run_priced", run)
     points = np.zeros((3, len(search.coordinates)))
@@ -194,7 +202,7 @@ def test_the_start_fits_the_margin_to_the_prices() -> None:
     assert two.first_point()[-1] == pytest.approx(np.log(20.0) / np.log(100.0))
     rule: Any = make_policy("priced_threshold:margin=4,margin_exponent=1,price=0.1", task_of())
     same: Any = make_policy("priced_threshold:margin=1,price=0.1", task_of())  # 4 · 0.1 is below 1
-    results = [run_policies(task_of(), [policy], 4, 0)[0] for policy in (rule, same)]
+    results = [run_episodes(task_of(), policy, 4, 0) for policy in (rule, same)]
     np.testing.assert_array_equal(results[0].tokens, results[1].tokens)
 
 

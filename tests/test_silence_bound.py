@@ -15,6 +15,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.silence import (
     SilenceProblem,
     cost_bound,
@@ -45,7 +46,9 @@ def test_never_above_the_exact_optimum_of_remote_estimation(
 ) -> None:
     """And within a thousandth of it: the bound is not low for safety."""
     source = SourceProblem.create(coefficient=coefficient, price=price)
-    exact = solve_finite(source, horizon, grid=source.grid(horizon, step=0.02)).cost / horizon
+    reach = float(source.grid(horizon).points[-1])
+    grid = ErrorGrid.create(source.coefficient, source.deviation, reach, 0.02)
+    exact = solve_finite(source, horizon, grid=grid).cost / horizon
     noise = np.ones((horizon, 1, 1))
     problem = SilenceProblem.create([[coefficient]], [1.0], noise, price)
     coarse, fine = (solve_silence(problem, step).lower for step in (0.2, 0.03))

@@ -17,7 +17,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.solvers.ages import solve_ages
 from fusion_gym.solvers.bounds import lagrangian_bound
-from fusion_gym.solvers.grid import gaussian_rows
+from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import solve_average, solve_discounted, solve_finite
 from fusion_gym.solvers.source import SourceProblem
@@ -202,7 +202,8 @@ def test_short_episodes_by_hand() -> None:
     def _ends(e: float) -> tuple[float, float]:
         return -1.0 - 1.2 * e, 1.0 - 1.2 * e
 
-    fine = problem.grid(2, step=0.02)
+    reach = float(problem.grid(2).points[-1])
+    fine = ErrorGrid.create(problem.coefficient, problem.deviation, reach, 0.02)
     assert solve_finite(problem, 1, grid=fine).cost == pytest.approx(last(0.0), rel=2e-4)
     both = quad(lambda w: min(w * w + last(w), 1.0 + last(0.0)) * density(w), -8, 8, limit=200)
     solution = solve_finite(problem, 2, grid=fine)
@@ -225,7 +226,7 @@ def test_unstable_source_needs_a_reliable_channel() -> None:
     assert solve_average(SourceProblem.create(coefficient=1.2, price=5.0)).cost < 3.0
     lossy = SourceProblem.create(coefficient=1.2, price=5.0, drop=0.9)
     with pytest.raises(ConfigurationError, match="iterations"):
-        solve_average(lossy, lossy.grid(reach=20.0, step=0.2), iterations=20)
+        solve_average(lossy, ErrorGrid.create(1.2, 1.0, 20.0, 0.2), iterations=20)
 
 
 # --- several sources -----------------------------------------------------------------------------

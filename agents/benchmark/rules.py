@@ -24,7 +24,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import covers
 from fusion_gym.core.scale import prices_at
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.policy_batch import run_policies
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.rule_search import (
     Generation,
     ThresholdTrial,
@@ -136,7 +136,7 @@ def _try(task: Task, rule: ThresholdRule, values: Array, episodes: int) -> list[
 def _prices(task: Task, trials: Sequence[ThresholdTrial], job: SweepJob) -> tuple[float, ...]:
     """Return the prices at which the best of all trials spends the shares of ``always``."""
     always = make_policy("always", task)
-    most = float(run_policies(task, [always], job.episodes[0], TUNING_SEED)[0].tokens.mean())
+    most = float(run_episodes(task, always, job.episodes[0], TUNING_SEED).tokens.mean())
     tokens, error = np.array([(trial.tokens, trial.error) for trial in trials]).T
     prices = prices_at(tokens, error, np.array(job.shares) * most)
     for place in range(1, len(prices)):

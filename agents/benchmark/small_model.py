@@ -6,7 +6,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.output.files import DAMAGED
+from fusion_gym.training.checkpoint import DAMAGED
 from fusion_gym.validation import ConfigurationError
 
 OPTIMISER = "policy.optimizer.pth"

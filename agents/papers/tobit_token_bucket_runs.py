@@ -89,7 +89,7 @@ def single_sensor(sensor: int) -> Task:
 def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = TRIGGER) -> History:
     """Run the paper's trigger, or another policy, and record every step."""
     estimator: Any = task.estimator
-    rows, share = [], estimator.centre.feedback.share[:, None, None]
+    rows, share = [], estimator.centre.share[:, None, None]
     for batch, requests in walk(task, policy, episodes, seed):
         before, tokens = batch.state.estimate, batch.tokens
         outcome = batch.step(requests)
@@ -160,7 +160,7 @@ def terms(task: Task, history: History) -> Terms:
     k1, k2, k3, k4, k5, k6, _, _ = constants.kappa
     grow, shift = constants.second_moment
     horizon, _, episodes = history.truth.shape
-    share = centre.feedback.share[:, 0]
+    share = centre.share[:, 0]
     prior = np.moveaxis(history.prior_covariance, -1, 1)[:, None] / share[:, None, None, None]
     observed = sensors.measurement_matrix[..., 0][:, None]
     q = np.moveaxis(history.uncensored, -1, 2)

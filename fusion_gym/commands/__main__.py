@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.commands import missing_extra
 from fusion_gym.output.ending import report_errors
 from fusion_gym.validation import ConfigurationError, choice
 from fusion_gym.version import __version__
@@ -47,9 +46,10 @@ def load(name: str) -> Any:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except ModuleNotFoundError as error:
-        if missing_extra(error) is None:
+        missing = error.name or str(error)
+        if missing.partition(".")[0] == "fusion_gym":
             raise
-        sys.exit(missing_extra(error))
+        sys.exit(f"error: {missing} is missing: install fusion-gym with its extra 'agents'")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ from fusion_gym.output import tables
 from fusion_gym.policies.calibrated import agent_files
 from fusion_gym.policies.loading import model_file
 from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate
-from fusion_gym.training.environment import environment_of
 from fusion_gym.validation import refusal
 
 
@@ -50,7 +49,7 @@ class Calibrate(EnvironmentOptions, Long):
 
     def run(self) -> None:
         """Calibrate, write the policy and print a row for each price."""
-        env_id, options, _ = environment_of(self.env, self.config, self.options)
+        env_id, options = self.environment()
         task = make_task(env_id, **options)
         if task.reward.price.span is None:
             raise refusal("price_range", None, "the range of prices that the agents observe")

@@ -19,6 +19,7 @@ from fusion_gym.docstrings import plain_marks
 from fusion_gym.importing import trust_files
 from fusion_gym.output.ending import flush, report_errors
 from fusion_gym.output.progress import quietly
+from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import CONTROL, ConfigurationError, refusal
 
 Words = tuple[tuple[str, ...], ...]  # words of a repeatable option
@@ -112,6 +113,20 @@ class EnvironmentOptions:
     """Take environment and options from the YAML file of a training or from a shipped config."""
     options: SetOptions = field(default=(), kw_only=True)
     """Options of gym.make for the environment; they override all others."""
+
+    def environment(self) -> tuple[str, dict[str, Any]]:
+        """Return the id and the options of the environment."""
+        options = parse_settings("option", list(itertools.chain(*self.options)))
+        if self.config is None and self.env is None:
+            raise ConfigurationError("env = None is not allowed: give --env ID or --config FILE")
+        if self.config is None:
+            return str(self.env), options
+        # Imported here, because Stable-Baselines3 takes seconds to load.
+        from fusion_gym.training.checked import load_checked
+        from fusion_gym.training.config import Experiment
+
+        environment = load_checked(Experiment, self.config).environment
+        return self.env or environment.id, environment.options | options
 
 
 _REGISTRY = tyro.constructors.ConstructorRegistry()

@@ -15,9 +15,9 @@ and ``pareto.png`` (at most five curves, and the costs beside the best baseline'
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -84,7 +84,7 @@ class Compare(Long):
     def policies_of(self, task: Task) -> dict[str, float]:
         """Return the policy, or the policy at each price, with the price of a token."""
         if self.prices is None:
-            return {self.policy: float(task.reward.price.draw(np.array([0.5]))[0])}
+            return {self.policy: task.reward.price.middle}
         span = task.reward.price.span
         if span is None:
             reason = "left out, because the config has no price_range"
@@ -155,7 +155,7 @@ def other_curves(
 
     def cost(curve: SweepCurve) -> float:
         items = (baselines[name] for name in curve.policies(price))
-        return min(float((item.error_cost + middle * item.tokens).mean()) for item in items)
+        return min(float(item.cost(middle).mean()) for item in items)
 
     curves: dict[str, SweepCurve] = {}
     for curve in sorted(sweep.curves, key=cost):
@@ -167,8 +167,7 @@ def other_curves(
     ]
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """The policy at one price: its rate per sensor and step, its MSE, and both comparisons."""
 
     policy: str
@@ -179,11 +178,10 @@ class Point:
 
     def plain(self) -> dict[str, Any]:
         """Return the point as JSON."""
-        result = asdict(self)
-        for name in ("at_price", "at_rate"):
-            comparison = getattr(self, name)
-            result[name] = comparison._asdict() | {"difference": comparison.difference._asdict()}
-        return result
+        return self._asdict() | {
+            name: comparison._asdict() | {"difference": comparison.difference._asdict()}
+            for name, comparison in (("at_price", self.at_price), ("at_rate", self.at_rate))
+        }
 
 
 def _rule(policy: str) -> str:

@@ -29,7 +29,6 @@ from fusion_gym.output.progress import progress_bar, remark, writing
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.checked import checked
-from fusion_gym.training.environment import environment_of
 from fusion_gym.validation import ConfigurationError, refusal
 
 _DRAWN = 100  # episodes of the comparison of drawn with likeliest actions
@@ -81,7 +80,53 @@ class Evaluate(EnvironmentOptions, Long):
 
     def run(self) -> None:
         """Evaluate the policies and print the tables."""
-        evaluate(self)
+        env_id, options = self.environment()
+        task = make_task(env_id, **options)
+        names = list(dict.fromkeys(chain(*self.policies)))
+        if not names:
+            raise ConfigurationError("policies = [] is not allowed: give --policies NAME …")
+        if self.reference is not None and self.reference not in names:
+            raise refusal("reference", self.reference, f"one of the policies {names}")
+        if self.resume and self.reference:
+            raise ConfigurationError(
+                f"resume = True is not allowed with reference = {self.reference!r}: paired "
+                "differences need the episodes of every policy, and the JSON holds only their means"
+            )
+        policies = {name: make_policy(name, task) for name in names}
+        report = evaluation_report(env_id, task, self.episodes, self.seed, {})
+        done = finished(self.json, report) if self.resume else {"policies": {}}
+        results: dict[str, EpisodeResults] = {}
+        steps = self.episodes * task.horizon
+        if self.json is None:
+            remark("nothing is written (--json FILE keeps the results)")
+        else:
+            writing(("the results of each policy", self.json))
+        earlier = steps * len(done["policies"].keys() & policies.keys())
+        with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
+            for name, policy in policies.items():
+                if name in done["policies"]:
+                    report["policies"][name] = done["policies"][name]
+                    report["quantiles"][name] = done["quantiles"][name]
+                    continue
+                bar.say(name)
+                results[name] = run_episodes(task, policy, self.episodes, self.seed, bar.update)
+                report["policies"][name] = summarise(results[name])
+                report["quantiles"][name] = robust_summary(results[name])
+                write(self.json, report)
+                warn_of_draws(name, task, policy, results[name], self.seed)
+        differences = {
+            name: paired_difference(result, results[self.reference])
+            for name, result in results.items()
+            if self.reference and name != self.reference
+        }
+        if self.reference:
+            plain = {name: difference._asdict() for name, difference in differences.items()}
+            report["reference"] = {"name": self.reference, "differences": plain}
+        write(self.json, report)
+        title = f"{env_id}: {self.episodes} episodes of {task.horizon} steps, seed {self.seed}"
+        table = tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
+        tables.console().print(table)
+        tables.console().print(tables.state_table(task.plant.state_names, report["policies"]))
 
     def interrupted(self) -> str:
         """Return how to resume; paired differences need a new evaluation."""
@@ -90,58 +135,6 @@ class Evaluate(EnvironmentOptions, Long):
         if self.reference is not None:
             return f"interrupted: finished policies are in {self.json}; --reference begins again"
         return super().interrupted()
-
-
-def evaluate(command: Evaluate) -> dict[str, Any]:
-    """Run the evaluation of a command line and return its JSON."""
-    env_id, options, _ = environment_of(command.env, command.config, command.options)
-    task = make_task(env_id, **options)
-    names = list(dict.fromkeys(chain(*command.policies)))
-    if not names:
-        raise ConfigurationError("policies = [] is not allowed: give --policies NAME …")
-    if command.reference is not None and command.reference not in names:
-        raise refusal("reference", command.reference, f"one of the policies {names}")
-    if command.resume and command.reference:
-        raise ConfigurationError(
-            f"resume = True is not allowed with reference = {command.reference!r}: paired "
-            "differences need the episodes of every policy, and the JSON holds only their means"
-        )
-    policies = {name: make_policy(name, task) for name in names}
-    report = evaluation_report(env_id, task, command.episodes, command.seed, {})
-    done = finished(command.json, report) if command.resume else {"policies": {}}
-    results: dict[str, EpisodeResults] = {}
-    steps = command.episodes * task.horizon
-    if command.json is None:
-        remark("nothing is written (--json FILE keeps the results)")
-    else:
-        writing(("the results of each policy", command.json))
-    earlier = steps * len(done["policies"].keys() & policies.keys())
-    with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
-        for name, policy in policies.items():
-            if name in done["policies"]:
-                report["policies"][name] = done["policies"][name]
-                report["quantiles"][name] = done["quantiles"][name]
-                continue
-            bar.say(name)
-            results[name] = run_episodes(task, policy, command.episodes, command.seed, bar.update)
-            report["policies"][name] = summarise(results[name])
-            report["quantiles"][name] = robust_summary(results[name])
-            write(command.json, report)
-            warn_of_draws(name, task, policy, results[name], command.seed)
-    differences = {
-        name: paired_difference(result, results[command.reference])
-        for name, result in results.items()
-        if command.reference and name != command.reference
-    }
-    if command.reference:
-        plain = {name: difference._asdict() for name, difference in differences.items()}
-        report["reference"] = {"name": command.reference, "differences": plain}
-    write(command.json, report)
-    title = f"{env_id}: {command.episodes} episodes of {task.horizon} steps, seed {command.seed}"
-    table = tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
-    tables.console().print(table)
-    tables.console().print(tables.state_table(task.plant.state_names, report["policies"]))
-    return report
 
 
 def warn_of_draws(

@@ -7,7 +7,7 @@ observation. The command compares it with the agent on 10,000 observations of wh
 removes it if they differ.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +22,6 @@ from fusion_gym.importing import require
 from fusion_gym.output.files import replacing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.training.environment import environment_of
 from fusion_gym.validation import ConfigurationError, refusal
 
 _KINDS = ("zoo", "model")
@@ -91,8 +90,7 @@ def spec(text: str) -> str:
 
 def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:
     """Return id and options of the command line, or of the agent's training by default."""
-    config = command.config
-    if command.env is None and config is None:
+    if command.env is None and command.config is None:
         if kind == "zoo":
             trained = zoo.card(name)["training"]["environment"]
             own = parse_settings("option", [word for words in command.options for word in words])
@@ -101,9 +99,8 @@ def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, 
         if not config_file.is_file():
             where = f"with model = {command.model!r}, whose folder has no config.yaml"
             raise forbidden("env", None, "give --env ID or --config FILE", where)
-        config = str(config_file)
-    env_id, options, _ = environment_of(command.env, config, command.options)
-    return env_id, options
+        command = replace(command, config=str(config_file))
+    return command.environment()
 
 
 def _shape(shape: tuple[str | int, ...]) -> str:

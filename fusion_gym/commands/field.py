@@ -24,7 +24,6 @@ import tyro
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.fit import plant_text
 from fusion_gym.commands.options import Between, OutputFolder, Whole
-from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.field_study import (
     ENV,
     METHODS,
@@ -33,15 +32,14 @@ from fusion_gym.evaluation.field_study import (
     at_rate,
     compare_with_practice,
     measure,
-    point_of,
+    point_at,
     simulate_sizes,
 )
 from fusion_gym.output.data_card import draw_card
 from fusion_gym.output.field_report import FieldReport, draw_curves, write_report
 from fusion_gym.output.files import read_json, write, write_text
-from fusion_gym.output.folders import check_inputs, lock_folder
+from fusion_gym.output.folders import check_inputs, held, lock_folder
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.recordings import Recording, fit
 from fusion_gym.recordings.fitting import criticise, deviations, noisy_channels, warnings_of
 from fusion_gym.recordings.recording import SHIPPED
@@ -92,10 +90,7 @@ class Field(Long):
         inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
         place = self.output / "study.json"
         if place.exists() and not self.resume:
-            raise ConfigurationError(
-                f"output = {str(self.output)!r} already holds a study: continue with --resume, or "
-                "give another --output"
-            )
+            raise held(self.output, "a study")
         if place.exists():
             check_inputs(inputs, read_json(place, "output"), f"the study in {str(self.output)!r}")
         plant = fit(recording, self.share, self.exact, order=1)  # a hold has no lags
@@ -159,10 +154,8 @@ class Field(Long):
 
 def _measure(study: FieldStudy, name: str, path: Path, folder: Path, timesteps: int) -> str:
     """Measure one method, and write its points."""
-    if name == AGENT:
-        points = train_agent(study, folder / "agent", timesteps)
-    else:
-        points = measure(study, name)
+    own = name == AGENT
+    points = train_agent(study, folder / "agent", timesteps) if own else measure(study, name)
     write(path, {"points": [asdict(point) for point in points]})
     return name
 
@@ -188,12 +181,7 @@ def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodP
     )
     if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
         raise KeyboardInterrupt
-    points = []
-    for price in prices:
-        rule, runs = f"model:{folder / 'best_model.zip'},price={price!r}", []
-        for source in (study.source, "recorded"):
-            task = study.task("joint", source, **drawn, reward_scale=1.0)
-            count = getattr(task.noise, "count", 128)
-            runs.append(run_episodes(task, make_policy(rule, task), count, 0))
-        points.append(point_of(study, [price], *runs))
-    return points
+    rule, priced = f"model:{folder / 'best_model.zip'}", {**drawn, "reward_scale": 1.0}
+    return [
+        point_at(study, [price], "joint", priced, f"{rule},price={price!r}") for price in prices
+    ]

@@ -58,11 +58,8 @@ class Fit(Command):
         white = residual_correlations(plant, values[rows:])
         text = ", ".join(f"{name} {value:.2f} (lag {lag})" for name, lag, value in white)
         print(f"largest correlations of residuals in ten lags: {text}")
-        for line in (
-            *recording.remarks,
-            *plant.remarks,
-            *warnings_of(plant, values[rows:], criticism),
-        ):
+        warnings = warnings_of(plant, values[rows:], criticism)
+        for line in (*recording.remarks, *plant.remarks, *warnings):
             remark(f"warning: {line}")
         if names := noisy_channels(plant):
             remark(f"measurement noise of {', '.join(names)}: their readings are no truth")

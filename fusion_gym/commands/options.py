@@ -11,7 +11,6 @@ import errno
 import os
 import tempfile
 import typing
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -20,16 +19,8 @@ from typing import Annotated, Any
 from fusion_gym.validation import integer, number, refusal
 
 
-class Mark(ABC):
-    """The allowed values of an option."""
-
-    @abstractmethod
-    def check(self, option: str, value: Any) -> None:
-        """Check one value."""
-
-
 @dataclass(frozen=True)
-class Whole(Mark):
+class Whole:
     """A whole number within limits."""
 
     at_least: int
@@ -41,7 +32,7 @@ class Whole(Mark):
 
 
 @dataclass(frozen=True)
-class Between(Mark):
+class Between:
     """A finite number above one limit, and at most the other."""
 
     above: float
@@ -52,7 +43,7 @@ class Between(Mark):
         number(option, value, above=self.above, at_most=self.at_most)
 
 
-class OutputFolder(Mark):
+class OutputFolder:
     """A folder that can be written or created."""
 
     def check(self, option: str, value: Any) -> None:
@@ -60,7 +51,7 @@ class OutputFolder(Mark):
         writable_folder(option, Path(value))
 
 
-class OutputFile(Mark):
+class OutputFile:
     """A file with one of the given endings, which can be replaced or created."""
 
     def __init__(self, *endings: str) -> None:
@@ -75,12 +66,13 @@ class OutputFile(Mark):
         writable_file(option, path)
 
 
+Mark = Whole | Between | OutputFolder | OutputFile
+
 # Larger numbers would exceed any time or memory.
 Episodes = Annotated[int, Whole(1, 100_000_000)]
 Steps = Annotated[int | None, Whole(1, 10**12)]
 Seed = Annotated[int, Whole(0)]
-_TRAINING = Whole(0, 2**32 - 1)  # the limits of torch and numpy
-TrainingSeed = Annotated[int | None, _TRAINING]
+TrainingSeed = Annotated[int | None, Whole(0, 2**32 - 1)]  # the limits of torch and numpy
 
 
 def check_options(values: Any) -> None:

@@ -35,11 +35,10 @@ from fusion_gym.evaluation.rule_search import (
 )
 from fusion_gym.output import tables
 from fusion_gym.output.files import read_json, write
-from fusion_gym.output.folders import check_inputs, lock_folder
+from fusion_gym.output.folders import check_inputs, held, lock_folder
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.checked import checked
-from fusion_gym.training.environment import environment_of
 from fusion_gym.validation import ConfigurationError
 
 _GENERATIONS, _RESULT = "generations.json", "search.json"
@@ -62,8 +61,11 @@ class Search(EnvironmentOptions, Long):
 
     def run(self) -> None:
         """Search, write and print the rule."""
-        env_id, options, _ = environment_of(self.env, self.config, self.options)
-        search = self.rule_search(env_id, options)
+        env_id, options = self.environment()
+        task = make_task(env_id, **options)
+        prices = token_prices(env_id, options, task, self.prices)
+        search = search_of_class(self.class_name, task, prices, generations=self.generations)
+        make_policy(search.text, task)  # refuses before it creates a folder
         inputs: dict[str, Any] = {"env": env_id, "class": self.class_name, "prices": search.prices}
         inputs |= {"generations": self.generations, "settings": search.task.settings}
         self.earlier(inputs)  # refuses before it creates a folder
@@ -73,14 +75,6 @@ class Search(EnvironmentOptions, Long):
             write(self.output / _RESULT, asdict(result) | {"inputs": inputs})
         print(result.policy)
         tables.console().print(result_table(env_id, result))
-
-    def rule_search(self, env_id: str, options: dict[str, Any]) -> RuleSearch:
-        """Return the search of the class in this environment."""
-        task = make_task(env_id, **options)
-        prices = token_prices(env_id, options, task, self.prices)
-        result = search_of_class(self.class_name, task, prices, generations=self.generations)
-        make_policy(result.text, task)
-        return result
 
     def continued(self, search: RuleSearch, inputs: dict[str, Any]) -> SearchResult:
         """Run the search after its earlier generations, and write every generation to the file."""
@@ -104,15 +98,13 @@ class Search(EnvironmentOptions, Long):
 
     def earlier(self, inputs: dict[str, Any]) -> list[Generation]:
         """Return the generations in the folder, of the same search."""
-        path, place = self.output / _GENERATIONS, f"output = {str(self.output)!r}"
+        path = self.output / _GENERATIONS
         if not self.resume:
             if path.exists() or (self.output / _RESULT).exists():
-                raise ConfigurationError(
-                    f"{place} already holds a search: continue with --resume, or give another "
-                    "--output"
-                )
+                raise held(self.output, "a search")
             return []
         if not path.exists():
+            place = f"output = {str(self.output)!r}"
             raise ConfigurationError(f"{place} holds no search: nothing to resume")
         content = read_json(path, "output")
         check_inputs(inputs, content.get("inputs"), f"the search in {str(self.output)!r}")

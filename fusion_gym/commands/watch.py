@@ -25,7 +25,6 @@ from fusion_gym.importing import require
 from fusion_gym.output.films import ENDINGS, save_film
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.training.environment import environment_of
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Watch(EnvironmentOptions, Long):
         """Show or save the episode."""
         if self.save is not None:
             require("save", "render", "imageio", "imageio_ffmpeg")
-        env_id, options, _ = environment_of(self.env, self.config, self.options)
+        env_id, options = self.environment()
         task = make_task(env_id, **options)
         names = [self.policy] if self.against is None else [self.policy, self.against]
         if len(set(names)) < len(names):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
@@ -92,14 +94,17 @@ class Estimator(ABC, Generic[StateT]):
             state: State after :meth:`update` or :meth:`start`.
         """
 
-    @abstractmethod
     def observe(self, state: StateT, measurement: Array) -> StateT:
         """Return the state after each node has its own new measurement.
+
+        By default only the field ``measurement`` changes.
 
         Args:
             state: State after :meth:`predict`.
             measurement: (l, m, N); NaN where a sensor has no reading.
         """
+        observed: StateT = replace(cast(Any, state), measurement=measurement)
+        return observed
 
     @abstractmethod
     def update(self, state: StateT, reception: Reception) -> StateT:
@@ -128,24 +133,27 @@ class Estimator(ABC, Generic[StateT]):
         covariance: Array = cast(Any, state).covariance
         return covariance
 
-    @abstractmethod
     def local_means(self, state: StateT) -> Array:
-        """Return the nodes' means (l, n, N) before any feedback.
+        """Return the nodes' means (l, n, N) before any feedback, by default the centre's.
 
         Args:
             state: State after :meth:`update`.
         """
+        mean = self.mean(state)
+        return np.broadcast_to(mean, (len(cast(Any, state).measurement), *mean.shape))
 
-    @abstractmethod
     def read(self, state: StateT, failure: Array | None = None) -> SignalValues:
         """Return the signals by name, as arrays or as functions that compute them.
 
-        ``variance_reduction`` supposes an arrival.
+        By default they are the state's fields of the same names. ``variance_reduction`` supposes an
+        arrival.
 
         Args:
             state: State after :meth:`observe`.
             failure: Probability (l, N) that the network loses a packet now; ``None`` is 0.
         """
+        names = (signal.name for signal in self.signals)
+        return {name: getattr(state, name) for name in names if hasattr(state, name)}
 
     @property
     def adopts(self) -> bool:

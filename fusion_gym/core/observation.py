@@ -44,48 +44,42 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     """Return the network's blocks, whose values are functions of `Runs`."""
     bucket, channel, price = task.network.bucket, task.network.channel, task.reward.price
     capacity, nodes = bucket.capacity, numbered(task.sensors)
-    channels = Block(
+    own, shared = partial(Block, node="own"), partial(Block, node="broadcast")
+    channels = own(
         "channel",
         "state of the channel at the step before, one-hot",
         lambda runs: runs.channel_state()[:, None] == np.arange(len(STATES))[:, None],
         (nodes, STATES),
-        node="own",
     )
-    tokens = Block(
+    tokens = shared(
         "tokens",
         "tokens over the capacity",
         lambda runs: runs.tokens / capacity,
-        node="broadcast",
         constants={"capacity": capacity},
     )
-    admitted = Block(
+    admitted = own(
         "admitted",
         "whether the access rule admits the sensor in this step",
         lambda runs: runs.admitted(),
         (nodes,),
-        node="own",
     )
-    queue = Block(
+    queue = own(
         "queue",
         "place in the queue over the number of sensors, 0 for the head",
         lambda runs: runs.state.network.queue / task.sensors,
         (nodes,),
-        node="own",
         constants={"sensors": task.sensors},
     )
-    left = Block(
+    left = shared(
         "time_left",
         "remaining steps over the horizon",
         lambda runs: (runs.limit - runs.steps) / task.horizon,
-        node="broadcast",
         constants={"horizon": task.horizon},
     )
-    place = "log(price/low) / log(high/low) of the price range"
-    block = Block(
+    block = shared(
         "price",
-        place,
+        "log(price/low) / log(high/low) of the price range",
         lambda runs: price.encode(runs.price),
-        node="broadcast",
         constants={} if price.span is None else {"range": price.span},
     )
     decides = task.network.access in ("round_robin", "random")

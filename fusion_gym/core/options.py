@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion_gym import declaration
+from fusion_gym import declaration, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import Channel
 from fusion_gym.core.estimator import Estimator
@@ -157,6 +157,12 @@ class CommonOptions:
             allowed = f"'sensors' or 'centre'; for decentralised sensors use {calls}"
             raise refusal("information", "local", allowed)
         declaration.check(self)
+
+    def own_weights(self, states: int) -> Array | None:
+        """Return the checked ``state_weights`` (n,), or ``None`` without them."""
+        if self.state_weights is None:
+            return None
+        return validation.not_negative("state_weights", self.state_weights, (states,))
 
     def nominal(self) -> Self:
         """Return the options that scale the reward: plant, sensors and network."""

@@ -239,6 +239,11 @@ class Price:
         low, high = self.span
         return low * (high / low) ** uniform
 
+    @property
+    def middle(self) -> float:
+        """The fixed price, or the geometric mean of the range."""
+        return float(self.draw(np.array([0.5]))[0])
+
     def encode(self, price: Array) -> Array:
         """Return the position of prices in the logarithmic range, from 0 to 1."""
         if self.span is None:

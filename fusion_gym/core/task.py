@@ -147,10 +147,8 @@ class Task:
             ConfigurationError: A value is not allowed.
         """
         options, plant = scenario.options, scenario.plant
-        for name, part, kind in (
-            ("plant", plant, Plant),
-            ("estimator", scenario.estimator, Estimator),
-        ):
+        parts = (("plant", plant, Plant), ("estimator", scenario.estimator, Estimator))
+        for name, part, kind in parts:
             if not isinstance(part, kind):
                 allowed = f"an instance of {kind.__module__}.{kind.__name__}"
                 raise validation.refusal(name, part, allowed)

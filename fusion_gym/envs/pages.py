@@ -7,11 +7,7 @@ from pathlib import Path
 from fusion_gym.core.communication import FEATURES
 from fusion_gym.core.knowledge import Block, covers, numbered
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.observation import (
-    belief_blocks,
-    block_entries,
-    network_blocks,
-)
+from fusion_gym.core.observation import belief_blocks, block_entries, network_blocks
 from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
@@ -132,10 +128,8 @@ def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
 
 def _visibility(task: Task, block: Block) -> str:
     """Return the part of a block that a local sensor observes."""
-    entries = block_entries(block)
-    return (
-        "all" if all(is_received(entry, task.broadcast) for entry in entries) else _SEES[block.node]
-    )
+    received = all(is_received(entry, task.broadcast) for entry in block_entries(block))
+    return "all" if received else _SEES[block.node]
 
 
 def _axis(task: Task, block: Block, place: int) -> str:

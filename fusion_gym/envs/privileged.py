@@ -119,25 +119,19 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         result = alternatives(
             before, self._requests, self.batch.normals(), outcome, observation, self.batch.beliefs()
         )
-        reference = self._reference_error()
-        if reference is not None:
-            reference = reference[:, None]
-        reward = self._error_term(result.error, reference) + result.communication
+        reward = self._error_term(result.error) + result.communication
         self._branched = Branched(reward * scale, result.observation)
         return outcome
 
     def _reward(self, outcome: Outcome) -> Array:
         if self.error == "squared":
             return outcome.reward
-        term = self._error_term(outcome.error, self._reference_error())
-        return term + outcome.reward_communication
+        return self._error_term(outcome.error[:, None])[0] + outcome.reward_communication
 
-    def _reference_error(self) -> Array | None:
-        return None if self.error == "squared" else self.batch.reference_error
-
-    def _error_term(self, error: Array, reference_error: Array | None) -> Array:
-        shift = np.zeros(1) if reference_error is None else reference_error
-        return self.task.reward.training_error(self.error, error, shift)
+    def _error_term(self, error: Array) -> Array:
+        """Return the error term (A, N) of errors (n, A, N)."""
+        reference = error if self.error == "squared" else self.batch.reference_error[:, None]
+        return self.task.reward.training_error(self.error, error, reference)
 
 
 def reference_estimator(

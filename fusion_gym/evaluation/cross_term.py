@@ -9,7 +9,6 @@ policy if x* is the conditional mean given all that x̂ and the policy use. If x
 approximation, the cross term need not be zero, and training on the mismatch is biased.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -17,11 +16,11 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import BATCH
 from fusion_gym.evaluation.intervals import LEVEL, Interval, mean_interval
+from fusion_gym.evaluation.policy_batch import seeded
 from fusion_gym.policies.base import Policy, decide, owner_of
 
 
@@ -99,21 +98,14 @@ def usual_policies(task: Task, rate: float) -> list[str]:
     random = f"random:rate={rate:.4g}"
     if task.information != "sensors":
         return [random, "always"]
-    price = task.reward.price
-    middle = price.fixed
-    if middle is None:
-        assert price.span is not None  # Price.create refuses a drawn price without one
-        middle = math.sqrt(price.span[0] * price.span[1])
-    return [random, f"value_of_information:price={middle:.4g}"]
+    return [random, f"value_of_information:price={task.reward.price.middle:.4g}"]
 
 
 def _run(
     task: Task, system: Estimator[Any], policy: Policy, episodes: int, seed: int,
 ) -> Array:  # fmt: skip
     """Return rate, error, floor and mismatch (4, E) of episodes, each a mean over steps."""
-    batch = EpisodeBatch(task, episodes, owner_of(policy), system)
-    batch.seed(np.arange(episodes), [seed + place for place in range(episodes)])
-    batch.reset()
+    batch = seeded(task, owner_of(policy), seed + np.arange(episodes), system)
     weights, sums = task.relative_weights[:, 0], np.zeros((4, episodes))
     for requests in decide(policy, batch, seed):
         outcome = batch.step(requests)

@@ -62,8 +62,7 @@ def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]
         EnvelopePoint(name, float(result.rate.mean()), float(result.mse.mean()))
         for name, result in sorted(results.items())
     ]
-    rates = np.array([point.rate for point in points])
-    errors = np.array([point.mse for point in points])
+    rates, errors = np.array([(point.rate, point.mse) for point in points]).T
     return [points[place] for place in lower_hull(rates, errors)]
 
 
@@ -183,9 +182,9 @@ def compare_at_price(
         ConfigurationError: no baselines, or another number of episodes.
     """
     _check_pairs(results, baselines)
-    costs = {name: item.error_cost + price * item.tokens for name, item in baselines.items()}
+    costs = {name: item.cost(price) for name, item in baselines.items()}
     best = min(costs, key=lambda name: float(costs[name].mean()))
-    difference = results.error_cost + price * results.tokens - costs[best]
+    difference = results.cost(price) - costs[best]
     return PriceComparison(price, best, float(costs[best].mean()), mean_interval(difference))
 
 

@@ -18,6 +18,7 @@ from fusion_gym.fusion.intersection import orthonormalise
 from fusion_gym.policies.base import Policy, decide, owner_of
 
 _EPISODE_MEANS = ("mse", "error_cost", "bound_trace", "nees", "tokens", "denied", "diverged")
+Progress = Callable[[int], Any] | None
 BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on the machine
 
 
@@ -65,13 +66,17 @@ class EpisodeResults:
         """Number of episodes E."""
         return len(self.mse)
 
+    def cost(self, price: float | Array) -> Array:
+        """Return error + price · tokens (E,), for one price of a token or one per episode (E,)."""
+        return self.error_cost + price * self.tokens
+
 
 def run_episodes(
     task: Task,
     policy: Policy,
     episodes: int = 100,
     seed: int = 0,
-    progress: Callable[[int], Any] | None = None,
+    progress: Progress = None,
 ) -> EpisodeResults:
     """Run a policy on episodes with consecutive seeds from ``seed``.
 
@@ -107,7 +112,7 @@ def run_several(
     policies: Sequence[Policy],
     episodes: int,
     seed: int,
-    progress: Callable[[int], Any] | None = None,
+    progress: Progress = None,
 ) -> list[EpisodeResults]:
     """Run policies as :func:`run_episodes` does, those with one owner of beliefs in one batch.
 
@@ -132,12 +137,35 @@ def run_several(
     for _, same in groupby(policies, owner_of):
         group, size = list(same), max(1, BATCH // episodes)
         for some in (group[place : place + size] for place in range(0, len(group), size)):
-            parts = [
-                _run_batch(task, some, min(BATCH, episodes - first), seed + first, progress)
-                for first in range(0, episodes, BATCH)
-            ]
+            policy = some[0] if len(some) == 1 else Together(task, some)
+            parts = []
+            for first in range(0, episodes, BATCH):
+                seeds = seed + np.arange(first, min(first + BATCH, episodes))
+                batch = seeded(task, owner_of(some[0]), np.tile(seeds, len(some)))
+                parts.append(_results(batch, policy, seed + first, len(some), progress))
             results += map(_joined, zip(*parts, strict=True))
     return results
+
+
+def run_priced(
+    task: Task, policy: Policy, seeds: NDArray[np.int64], prices: Array
+) -> EpisodeResults:
+    """Run one policy on E seeds, each at its own price of a token.
+
+    The signals and the reward use these prices instead of the price of the task.
+
+    Args:
+        task: the task.
+        policy: the policy.
+        seeds: seeds of the episodes (E,).
+        prices: price of a token in each episode (E,).
+
+    Raises:
+        LookupError: the policy uses a signal that the task withholds.
+    """
+    batch = seeded(task, owner_of(policy), seeds)
+    batch.price = np.array(prices, dtype=np.float64)
+    return _results(batch, policy, int(seeds[0]))[0]
 
 
 def _joined(parts: Sequence[EpisodeResults]) -> EpisodeResults:
@@ -153,8 +181,13 @@ def _joined(parts: Sequence[EpisodeResults]) -> EpisodeResults:
     return EpisodeResults(**joined, squared_error=np.asarray(error))
 
 
-def _normalised_error(error: Array, covariance: Array) -> Array:
-    """Return eᵀ P⁺ e over the rank of P (N,)."""
+def _normalised_error(task: Task, state: Any, error: Array, covariance: Array) -> Array:
+    """Return eᵀ P⁺ e over the rank of P (N,), of the known truths alone."""
+    available = task.plant.available(state.plant)
+    if available is not None:
+        known = available[1]
+        covariance = np.where(known[:, None] & known, covariance, np.eye(len(known))[..., None])
+        error = error * np.sqrt(len(known) / np.maximum(known.sum(0), 1))
     result = linalg.dot(error, linalg.solve_vector(covariance, error)) / len(error)
     lanes = np.flatnonzero(np.isnan(result) & np.isfinite(covariance).all((0, 1)))
     if lanes.size:
@@ -165,39 +198,22 @@ def _normalised_error(error: Array, covariance: Array) -> Array:
     return result
 
 
-def _counted(task: Task, state: Any, error: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return error and covariance whose normalised error has only the known truths."""
-    available = task.plant.available(state.plant)
-    if available is None:
-        return error, covariance
-    known = available[1]
-    covariance = np.where(known[:, None] & known, covariance, np.eye(len(known))[..., None])
-    return error * np.sqrt(len(known) / np.maximum(known.sum(0), 1)), covariance
-
-
-def _run_batch(
-    task: Task,
-    policies: Sequence[Policy],
-    episodes: int,
-    seed: int,
-    progress: Callable[[int], Any] | None,
+def _results(
+    batch: EpisodeBatch, policy: Policy, seed: int, parts: int = 1, progress: Progress = None
 ) -> list[EpisodeResults]:
-    """Return the results of policies with one owner of beliefs, all in one batch."""
-    runs = len(policies) * episodes
-    batch = seeded(task, owner_of(policies[0]), seed + np.arange(runs) % episodes)
-    policy = policies[0] if len(policies) == 1 else Together(task, policies)
-    horizon, sensors = task.horizon, task.sensors
+    """Run an episode of all runs of a batch, and return the results of its equal parts."""
+    task, runs = batch.task, batch.num_envs
+    horizon, sensors, episodes = task.horizon, task.sensors, runs // parts
     means = {name: np.zeros(runs) for name in _EPISODE_MEANS}
     rate, requests = np.zeros((sensors, runs)), np.zeros((sensors, runs))
     returns, squared_error = np.zeros(runs), []
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
         covariance = task.estimator.covariance(batch.delivered.estimate)
-        squared_error.append(outcome.squared_error.reshape(-1, len(policies), episodes).mean(-1))
+        squared_error.append(outcome.squared_error.reshape(-1, parts, episodes).mean(-1))
         means["mse"] += outcome.squared_error.sum(0)
         means["bound_trace"] += linalg.trace(covariance)
-        counted = _counted(task, batch.delivered, outcome.error, covariance)
-        means["nees"] += _normalised_error(*counted)
+        means["nees"] += _normalised_error(task, batch.delivered, outcome.error, covariance)
         means["tokens"] += outcome.cost
         means["denied"] += (outcome.requested & ~outcome.granted).sum(0)
         means["error_cost"] -= outcome.reward_error

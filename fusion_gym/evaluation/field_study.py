@@ -123,7 +123,9 @@ def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
         best = minimize(objective, first, method="Powell", bounds=bounds, options=limits)
         middle = np.exp(start + best.x)
     sizes = [at_rate(study, name, middle, study.rate * factor, _NEAR) for factor in FACTORS]
-    return [point_at(study, name, own) for own in sizes]
+    return [
+        point_at(study, own.tolist(), METHODS[name][0], *rule_of(study, name, own)) for own in sizes
+    ]
 
 
 def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[dict[str, Any], str]:
@@ -138,15 +140,16 @@ def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[dict[str, Any],
     return {"trigger": "report_on_change", "trigger_threshold": thresholds}, rule
 
 
-def point_at(study: FieldStudy, name: str, sizes: Array) -> MethodPoint:
-    """Return a method's results in simulation and on all windows of the held-out part."""
-    options, rule = rule_of(study, name, sizes)
-    runs = {}
+def point_at(
+    study: FieldStudy, sizes: list[float], filter_name: str, options: Mapping[str, Any], rule: str
+) -> MethodPoint:
+    """Return a rule's results in simulation and on all windows of the held-out part."""
+    runs = []
     for source in (study.source, "recorded"):
-        task = study.task(METHODS[name][0], source, **options)
+        task = study.task(filter_name, source, **options)
         count = getattr(task.noise, "count", 4 * _EPISODES)
-        runs[source] = run_episodes(task, make_policy(rule, task), count, 0)
-    return point_of(study, sizes.tolist(), runs[study.source], runs["recorded"])
+        runs.append(run_episodes(task, make_policy(rule, task), count, 0))
+    return point_of(study, sizes, *runs)
 
 
 def point_of(
@@ -186,8 +189,7 @@ def at_rate(study: FieldStudy, name: str, shape: Array, rate: float, reach: floa
             low = middle
         else:
             high = middle
-    result: Array = np.exp(middle) * shape
-    return result
+    return np.exp(middle) * shape
 
 
 def compare_with_practice(

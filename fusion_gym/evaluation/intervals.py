@@ -53,7 +53,7 @@ def mean_interval(samples: Array, seed: int = 0, level: float = LEVEL) -> Interv
         return Interval(mean, mean, mean)
     from scipy import stats  # takes a third of a second
 
-    result = stats.bootstrap(
+    low, high = stats.bootstrap(
         (samples,),
         np.mean,
         n_resamples=RESAMPLES,
@@ -61,6 +61,5 @@ def mean_interval(samples: Array, seed: int = 0, level: float = LEVEL) -> Interv
         confidence_level=level,
         method="percentile",
         rng=np.random.default_rng(seed),
-    )
-    interval = result.confidence_interval
-    return Interval(mean, float(interval.low), float(interval.high))
+    ).confidence_interval
+    return Interval(mean, float(low), float(high))

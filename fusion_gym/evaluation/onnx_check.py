@@ -132,7 +132,8 @@ class _FileComparison:
         if "grantable" in self._graph.inputs:
             request["grantable"] = signals["grantable"].T.reshape(len(request["observation"]), -1)
         ours, theirs = self._memories
-        result = self._run_session(request | ours)
+        written = self._session.run(None, request | ours)
+        result = dict(zip(self._graph.outputs, written, strict=True))
         required = self._run_torch(request | theirs)
         self._memories = [_following(result), _following(required)]
         requests = self._agent(signals)
@@ -146,9 +147,6 @@ class _FileComparison:
                 relative = apart / (1.0 + np.abs(required[name]))
                 self.relative = max(self.relative, float(relative.max()))
         return requests
-
-    def _run_session(self, value: Values) -> Values:
-        return dict(zip(self._graph.outputs, self._session.run(None, value), strict=True))
 
     def _run_torch(self, value: Values) -> Values:
         inputs = [torch.as_tensor(np.ascontiguousarray(value[name])) for name in self._graph.inputs]

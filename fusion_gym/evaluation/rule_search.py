@@ -22,7 +22,7 @@ import numpy as np
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.policy_batch import EpisodeMeans, run_policies, run_priced
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced, run_several
 from fusion_gym.importing import require
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.priced_threshold import PricedThreshold, Score, ThresholdNumbers
@@ -252,9 +252,9 @@ def try_thresholds(
         raise validation.refusal("template", template, "a policy with {value} as its threshold")
     texts = [template.replace("{value}", f"{value:.5g}") for value in values]
     rules = [make_policy(text, task) for text in texts]
-    size, briefs = max(_RUNS // episodes, 1), list[EpisodeMeans]()
+    size, briefs = max(_RUNS // episodes, 1), list[EpisodeResults]()
     for first in range(0, len(rules), size):
-        briefs += run_policies(task, rules[first : first + size], episodes, seed)
+        briefs += run_several(task, rules[first : first + size], episodes, seed)
     return [
         ThresholdTrial(text, float(f"{value:.5g}"), float(brief.tokens.mean()), error)
         for text, value, brief in zip(texts, values, briefs, strict=True)
@@ -327,9 +327,9 @@ def search_result(search: RuleSearch, generations: Sequence[Generation]) -> Sear
     rule: Any = make_policy(policy, search.task)
     costs = _costs(search, rule.numbers, episodes, seed)[0]
     single = [make_policy(item.policy, search.task) for item in search.start]
-    briefs = [run_policies(search.task, [rule], episodes, seed)[0] for rule in single]
     references = [
-        float(b.cost(price).mean()) for b, price in zip(briefs, search.prices, strict=True)
+        float(run_episodes(search.task, rule, episodes, seed).cost(price).mean())
+        for rule, price in zip(single, search.prices, strict=True)
     ]
     return SearchResult(policy, search.prices, tuple(costs.tolist()), tuple(references))
 

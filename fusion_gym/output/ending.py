@@ -1,7 +1,6 @@
 """The end of a command: one line for errors of the user or the machine, and an exit status."""
 
 import contextlib
-import functools
 import io
 import os
 import signal
@@ -9,7 +8,6 @@ import sys
 import sysconfig
 import traceback
 from collections.abc import Callable, Iterator
-from typing import Any
 
 from fusion_gym.core.knowledge import SignalError
 from fusion_gym.validation import ConfigurationError
@@ -32,7 +30,8 @@ def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Ite
         interrupted: function that returns the line after an interrupt.
     """
     try:
-        _write_anything()
+        if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals lack characters
+            sys.stdout.reconfigure(errors="backslashreplace")
         with name_user_code():
             yield
         flush()
@@ -75,17 +74,13 @@ def name_user_code() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def on_signal(number: int, handler: Any) -> Iterator[None]:
-    """Handle a signal by this handler inside the context."""
-    before = signal.signal(number, handler)
+def ended_like_by_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM act like Ctrl-C inside the context, so that workers stop too."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
-        signal.signal(number, before)
-
-
-# SIGTERM acts like Ctrl-C, so that workers stop too.
-ended_like_by_ctrl_c = functools.partial(on_signal, signal.SIGTERM, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, before)
 
 
 def flush() -> None:
@@ -100,12 +95,6 @@ def _drop_output() -> None:
         flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _write_anything() -> None:
-    """Print characters that the terminal does not support as escapes."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _joined(message: object) -> str:

@@ -3,9 +3,6 @@
 import json
 import os
 import re
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,11 +10,6 @@ from typing import Any
 
 from fusion_gym.validation import ConfigurationError, read_text
 
-# Errors from a damaged archive; RuntimeError where a part is encrypted.
-DAMAGED = (
-    *(OSError, EOFError, KeyError, TypeError, ValueError, RuntimeError),
-    *(struct.error, zipfile.BadZipFile, zlib.error),
-)
 _PARTIAL = re.compile(r"\.\d+\.part(\.\w+)?$")  # with the id of the writing process
 
 

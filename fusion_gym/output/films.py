@@ -18,21 +18,19 @@ def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:
     import imageio.v2 as imageio
 
     writer: Any
-    settings: dict[str, Any]
-    if path.suffix.lower() in ("", ".gif"):
-        # 64 colours suffice for lines; only changed pixels are written.
+    gif = path.suffix.lower() in ("", ".gif")
+    settings: dict[str, Any] = {"fps": fps, "macro_block_size": 2}
+    if gif:  # 64 colours suffice for lines; only changed pixels are written
         settings = {"duration": 1000 / fps, "loop": 0, "palettesize": 64, "subrectangles": True}
-    else:
-        settings = {"fps": fps, "macro_block_size": 2}
     with replacing(path) as unfinished:
         # A GIF in memory, because its writer tries again on a full disk.
-        goal: Any = io.BytesIO() if path.suffix.lower() in ("", ".gif") else unfinished
+        goal: Any = io.BytesIO() if gif else unfinished
         # Closed after an error too, unlike by the writer's own context.
         with contextlib.closing(
             imageio.get_writer(goal, format=path.suffix[1:].upper() or "GIF", **settings)
         ) as writer:
             count = sum(writer.append_data(frame) is None for frame in frames)
-        if goal is not unfinished:
+        if gif:
             unfinished.write_bytes(goal.getvalue())
         elif not _complete(unfinished, count):
             raise OSError(errno.EIO, "the film is not complete; the disk may be full")

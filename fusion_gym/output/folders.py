@@ -36,6 +36,14 @@ def lock_folder(folder: Path, name: str) -> Iterator[None]:
         lock.release()
 
 
+def held(folder: Path, results: str) -> ConfigurationError:
+    """Return the error of a folder with earlier results."""
+    return ConfigurationError(
+        f"output = {str(folder)!r} already holds {results}: continue with --resume, or give "
+        "another --output"
+    )
+
+
 def fingerprint(inputs: Mapping[str, Any]) -> str:
     """Return a hash of plain inputs, the same in every process."""
     plain = json.dumps(inputs, sort_keys=True, default=list)

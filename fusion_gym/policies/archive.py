@@ -20,7 +20,7 @@ from fusion_gym.validation import ConfigurationError
 LARGEST = 256 * 2**20  # bytes of a part, and of all weights
 _MOST = 1_000  # tensors
 # Errors of zipfile on a damaged archive; RuntimeError where a part is encrypted.
-_DAMAGE = (
+DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
     OSError,
@@ -53,7 +53,7 @@ def read_weights(file: Path) -> dict[str, torch.Tensor]:
     try:
         with zipfile.ZipFile(content) as parts:
             listed = parts.infolist()
-    except _DAMAGE:
+    except DAMAGE:
         raise NeedsTrust("its policy.pth is not in torch's format") from None
     if any(part.compress_type != zipfile.ZIP_STORED for part in listed):
         raise NeedsTrust("its weights are compressed")
@@ -85,7 +85,7 @@ def read_part(file: Path, name: str) -> bytes:
                 return part.read(about.file_size)
     except KeyError:
         raise _none(f"it has no {name}") from None
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise _none(" ".join(str(error).split())[:100]) from None
 
 

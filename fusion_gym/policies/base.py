@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, get_args
+from typing import Any, ClassVar, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,22 +57,19 @@ class Policy(Protocol):
 
 def owner_of(policy: Policy) -> Owner | None:
     """Return the owner of the beliefs that a policy uses, or ``None`` if it uses no beliefs."""
-    result = getattr(policy, "memory_owner", None)
-    if result is None:
-        return None
-    validation.choice("memory_owner", result, get_args(Owner))
-    owner: Owner = result
+    owner: Owner | None = getattr(policy, "memory_owner", None)
+    if owner is not None:
+        validation.choice("memory_owner", owner, get_args(Owner))
     return owner
 
 
 def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     """Return the signals outside a policy's declared knowledge, with the reason of each refusal."""
     knower = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # no declaration: all signals
-    least = {signal.name: signal for signal in task.estimator.signals}
     if not task.memory and covers(knower, "own"):
         knower = least_covering((knower, "own_memory"))  # beliefs use only the new measurements
-    every = (*MEMORY_SIGNALS, *NETWORK_SIGNALS, *PLANNING_SIGNALS)
-    least |= {signal.name: signal for signal in every}
+    every = (*task.estimator.signals, *MEMORY_SIGNALS, *NETWORK_SIGNALS, *PLANNING_SIGNALS)
+    least = {signal.name: signal for signal in every}
     node: Knowledge = "own" if covers(task.knowledge, "own") else task.knowledge
     least["observation"] = Signal("observation", node, "(N, entries)", "rows of every class")
     return {
@@ -110,9 +107,13 @@ def decide(policy: Policy, batch: EpisodeBatch, seed: int) -> Iterator[Requests]
         yield decision(batch.signals())
 
 
-def is_stateless(policy: Policy) -> bool:
-    """Return whether a policy declares that it has no memory and draws nothing."""
-    return bool(getattr(policy, "stateless", False))
+class Stateless:
+    """Base class of policies that have no memory and draw nothing."""
+
+    stateless: ClassVar[bool] = True
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Do nothing; the policy has no memory."""
 
 
 class Rule:
@@ -271,8 +272,7 @@ def strongest(score: Array, requests: Requests, at_most: int | None, age: Array)
         at_most: largest number of requests in a run; None for no limit.
         age: steps since the last delivery (sensors, N).
     """
-    sensors = len(score)
-    if at_most is None or at_most >= sensors:
+    if at_most is None or at_most >= len(score):
         return requests
     xp = namespace(score, requests)
     ranked = xp.where(requests, score, -np.inf)

@@ -62,5 +62,4 @@ def check_owner(task: Task, own: bool, **only_together: Any) -> None:
 def beliefs_of(signals: Signals, own: bool) -> Beliefs:
     """Return the beliefs of the scheduler, or of each sensor."""
     result: Any = signals["own_beliefs" if own else "beliefs"]
-    beliefs: Beliefs = result
-    return beliefs
+    return result

@@ -18,7 +18,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals, least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.policies.archive import read_part
-from fusion_gym.policies.base import Requests
+from fusion_gym.policies.base import Requests, Stateless
 from fusion_gym.policies.loading import load_model_policy
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.registry import make_policy
@@ -48,7 +48,7 @@ def calibration_rule(text: str, task: Task) -> PricedThreshold:
 
 
 @dataclass(eq=False)
-class CalibratedPolicy:
+class CalibratedPolicy(Stateless):
     r"""Request where a mixture of an agent's logit and a rule's log ratio reaches a threshold.
 
     Args:
@@ -78,7 +78,6 @@ class CalibratedPolicy:
     rule: PricedThreshold
     points: Sequence[CalibrationPoint]
     price: float | None = None
-    stateless = True
 
     def __post_init__(self) -> None:
         for agent in self.agents:
@@ -94,9 +93,6 @@ class CalibratedPolicy:
         self.memory_owner = self.agents[0].memory_owner or self.rule.memory_owner
         classes = [agent.knowledge for agent in self.agents]
         self.knowledge = least_covering([*classes, self.rule.knowledge])
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Do nothing; the policy has no memory."""
 
     def single_agent(self) -> ModelPolicy:
         """Return the agent at the policy's price, with the threshold in its last layer.
@@ -147,9 +143,7 @@ class CalibratedPolicy:
             own = np.take_along_axis(logits, agent[None, None], 0)[0]
             score += (1.0 - mixture) * np.where(mixture < 1.0, own, 0.0)
         requests: Requests = score >= threshold
-        if (
-            self.task.network.access == "single"
-        ):  # an agent names one sensor, the rule leaves the choice
+        if self.task.network.access == "single":  # an agent names one sensor, the rule any
             best = score.argmax(0) == np.arange(len(score))[:, None]
             requests &= best | (mixture == 1.0)
         return requests

@@ -130,13 +130,8 @@ class Blueprint:
         if "format" not in card_entry:
             return _inferred(data)
         validation.integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
-        known = {
-            "format",
-            "reward_scale",
-            *ModelView.__dataclass_fields__,
-            *cls.__dataclass_fields__,
-        }
-        validation.keys("entry of the card", card_entry, known)
+        own = ModelView.__dataclass_fields__.keys() | cls.__dataclass_fields__.keys()
+        validation.keys("entry of the card", card_entry, {"format", "reward_scale"} | own)
         if not isinstance(card_entry.get("network"), dict):
             raise ConfigurationError("network is not allowed: it must be a table of sizes")
         return cls(
@@ -165,9 +160,7 @@ def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) ->
     names = [name for name, kind in ACTIVATIONS.items() if kind is policy.activation_fn]
     if not names:
         return entries
-    network = NetworkShape.from_shapes(
-        {name: tuple(w.shape) for name, w in policy.state_dict().items()}
-    )
+    network = NetworkShape.of_weights(policy.state_dict())
     plain = {"activation": names[0], "actions": str(model.action_space), "network": network.plain()}
     return {"format": FORMAT} | entries | plain
 

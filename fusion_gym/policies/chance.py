@@ -1,27 +1,28 @@
-"""Uniform random numbers for policies that draw, with one stream for each run."""
+"""Rules that draw uniform random numbers, with one stream for each run."""
+
+from typing import ClassVar
 
 import numpy as np
 
 from fusion_gym.arrays import Array
+from fusion_gym.policies.base import Rule
 
 _BLOCK = 64  # steps drawn at a time
 
 
-class Chance:
-    """A source of uniform numbers in [0, 1), independent of the noise of the same seeds.
+class ChanceRule(Rule):
+    """A rule that draws uniform numbers in [0, 1), independent of the noise of the same seeds.
 
-    Run i has the stream of ``seed + i`` and the policy's ``stream`` number, so its draws depend
+    Run i has the stream of ``seed + i`` and the rule's number ``stream``, so its draws depend
     neither on the other runs nor on any signal.
     """
 
-    def __init__(self, stream: int) -> None:
-        self._stream = stream
-        self.reset(0)
+    stream: ClassVar[int]
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Restart the streams."""
+        """Restart the random streams; run i draws from the stream of ``seed + i``."""
         seeds = range(seed, seed + runs)
-        self._generators = [np.random.default_rng([seed, self._stream]) for seed in seeds]
+        self._generators = [np.random.default_rng([seed, self.stream]) for seed in seeds]
         self._drawn: Array | None = None
         self._used = 0
 

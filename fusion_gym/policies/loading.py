@@ -109,15 +109,17 @@ def _rebuilt(
 ) -> tuple[BaseAlgorithm, str]:
     """Return the model from its card and its weights, and its kind of action."""
     blueprint, weights = Blueprint.read(data), read_weights(file)
-    network = NetworkShape.from_shapes(
-        {name: tuple(weight.shape) for name, weight in weights.items()}
-    )
+    network = NetworkShape.of_weights(weights)
     if blueprint.network not in (None, network.plain()):
         raise ConfigurationError(f"its card's network differs from its weights, {network.plain()}")
     if not network.fits(blueprint.algorithm):
         raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}")
     action, view = _fitted(task, observed, (network.entries,), blueprint.actions)
-    model = _empty(blueprint.algorithm, view)
+    # Without environment, buffers and optimiser, so it cannot learn.
+    kind: Any = ALGORITHMS[blueprint.algorithm]
+    base = POLICIES[blueprint.algorithm]
+    model = kind(base, env=None, device="cpu", _init_setup_model=False)
+    model.observation_space, model.action_space = view.space, view.actions
     model.policy = _policy(blueprint, network, view)
     try:
         model.policy.load_state_dict(weights, strict=True)
@@ -125,20 +127,9 @@ def _rebuilt(
         raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}") from None
     if blueprint.algorithm == "dqn":  # its random decisions need the exploration rate
         rate = data.get("exploration_rate", 0.0)
-        model.exploration_rate = validation.number(  # type: ignore[attr-defined]
-            "exploration_rate", rate, at_least=0.0, at_most=1.0
-        )
+        rate = validation.number("exploration_rate", rate, at_least=0.0, at_most=1.0)
+        model.exploration_rate = rate
     return model, action
-
-
-def _empty(algorithm: str, view: View) -> BaseAlgorithm:
-    """Return an algorithm without environment, buffers and optimiser, which cannot learn."""
-    kind: Any = ALGORITHMS[algorithm]
-    model: BaseAlgorithm = kind(
-        POLICIES[algorithm], env=None, device="cpu", _init_setup_model=False
-    )
-    model.observation_space, model.action_space = view.space, view.actions
-    return model
 
 
 def _policy(blueprint: Blueprint, network: NetworkShape, view: View) -> Any:

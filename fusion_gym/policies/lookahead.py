@@ -10,7 +10,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests
+from fusion_gym.policies.base import Requests, Stateless
 from fusion_gym.policies.belief_rule import check_owner, knows
 from fusion_gym.policies.planning import PlanningModel, transmission_sets
 from fusion_gym.validation import ConfigurationError
@@ -19,7 +19,7 @@ _MOST_TOGETHER = 8  # largest number of sensors for the comparison of all sets
 _MOST_GREEDY = 40  # largest number of sensors for the greedy search
 
 
-class Lookahead:
+class Lookahead(Stateless):
     r"""Request the set of sensors with the least expected error and price over the next steps.
 
     The best estimate x* uses all new measurements, and with memory all earlier ones. The second
@@ -65,7 +65,6 @@ class Lookahead:
     random_start=True token_rate=2 memory=True``.
     """
 
-    stateless: ClassVar[bool] = True
     memory_owner: ClassVar[Owner] = "scheduler"
 
     def __init__(self, task: Task, price: float = 0.01, steps: int = 4) -> None:
@@ -96,9 +95,6 @@ class Lookahead:
             order[np.searchsorted(number, number[sent] - (1 << sensor), sorter=order)]
             for sensor, sent in enumerate(self._sent)
         ]
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Do nothing; the policy has no memory."""
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""

@@ -31,8 +31,9 @@ class NetworkShape:
     memory: _Memory | None = None
 
     @classmethod
-    def from_shapes(cls, shapes: Shapes) -> NetworkShape:
-        """Return the networks that have weights of these shapes, after a check of all sizes."""
+    def of_weights(cls, weights: Mapping[str, Any]) -> NetworkShape:
+        """Return the networks that have these weights, after a check of all sizes."""
+        shapes = {name: tuple(weight.shape) for name, weight in weights.items()}
         if f"{_VALUES}.0.weight" in shapes:
             *hidden, last = _chain(shapes, _VALUES)
             entries = (hidden or [last])[0][1]

@@ -55,7 +55,12 @@ def onnx_card(
         "observation_low": graph.low.tolist(),
         "observation_high": graph.high.tolist(),
         "observation_blocks": blocks,
-        "action": _action(agent, graph),
+        "action": {
+            "space": str(agent.view.actions),
+            "sensors": task.sensors,
+            "access": task.network.access,
+            "choices": None if graph.choices is None else graph.choices.tolist(),
+        },
         "options": task.settings,
         "price_range": price if agent.price is None else None,
         "fixed_price": _fixed_price(agent),
@@ -80,31 +85,20 @@ def layout_version(environment: str, names: list[str]) -> str:
 
 
 def _ports(shapes: Shapes) -> dict[str, Any]:
-    types = {name: {"type": _TYPES.get(name, "float32")} for name in shapes}
-    return {
-        name: {"shape": list(shape), **types[name], "meaning": _MEANINGS[name]}
-        for name, shape in shapes.items()
-    }
+    rows = ((n, list(shape), _TYPES.get(n, "float32")) for n, shape in shapes.items())
+    return {n: {"shape": shape, "type": kind, "meaning": _MEANINGS[n]} for n, shape, kind in rows}
 
 
 def _block(block: Block, local: bool) -> dict[str, Any]:
     """Return a block of entries with the ``labels`` of its axes and its bounds."""
-    own = local and block.node == "own"
     return {
         "name": block.name,
         "meaning": block.meaning,
         "labels": [list(axis) for axis in block.labels],
-        "own_row": own,
+        "own_row": local and block.node == "own",
         "bounds": list(block.bounds),
         "constants": {key: np.asarray(value).tolist() for key, value in block.constants.items()},
     }
-
-
-def _action(agent: ModelPolicy, graph: DecisionGraph) -> dict[str, Any]:
-    """Return the action space and the requests of each of its numbers."""
-    choices = None if graph.choices is None else graph.choices.tolist()
-    space = {"space": str(agent.view.actions), "sensors": agent.task.sensors}
-    return space | {"access": agent.task.network.access, "choices": choices}
 
 
 def _fixed_price(agent: ModelPolicy) -> float | None:

@@ -1,18 +1,17 @@
 """The policy that attains the solved optimum of a remote-estimation task."""
 
 import dataclasses
-from typing import ClassVar
 
 import numpy as np
 
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests
+from fusion_gym.policies.base import Requests, Stateless
 from fusion_gym.solvers.task import solve_task
 
 
-class OptimalPolicy:
+class OptimalPolicy(Stateless):
     r"""Request by the optimum of the task.
 
     The exact optimum of an episode depends on the remaining steps, the stationary optimum does not
@@ -47,8 +46,6 @@ class OptimalPolicy:
     Example: ``optimal`` in ``fusion_gym/RemoteEstimation-v1``.
     """
 
-    stateless: ClassVar[bool] = True
-
     def __init__(self, task: Task, criterion: str = "finite", price: float | None = None) -> None:
         if price is not None:
             reward = dataclasses.replace(task.reward, price=Price.create(price))
@@ -60,9 +57,6 @@ class OptimalPolicy:
         """The class of a sensor with thresholds, and of a scheduler with a table of two sources."""
         return "own" if self.optimum.threshold is not None else "scheduler"
 
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Do nothing; the policy has no memory."""
-
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         optimum = self.optimum
@@ -72,8 +66,7 @@ class OptimalPolicy:
             threshold = optimum.threshold
             step = np.minimum(signals["step"], len(threshold) - 1)
             sensor = np.arange(len(error))[:, None]
-            request: Requests = error >= threshold[step, sensor, signals["channel_state"], level]
-            return request
+            return error >= threshold[step, sensor, signals["channel_state"], level]
         assert optimum.choice is not None
         assert optimum.grids is not None
         step = np.minimum(signals["step"], len(optimum.choice) - 1)

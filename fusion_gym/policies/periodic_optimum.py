@@ -15,7 +15,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests
+from fusion_gym.policies.base import Requests, Stateless
 from fusion_gym.systems.correlated.system import CorrelatedTrackingEstimator
 from fusion_gym.validation import ConfigurationError
 
@@ -38,7 +38,7 @@ class Schedule(NamedTuple):
 _cache: dict[str, Schedule] = {}
 
 
-class PeriodicOptimum:
+class PeriodicOptimum(Stateless):
     r"""Repeat the schedule of ``packets`` requests in ``period`` steps with the smallest trace.
 
     The search compares all schedules by the system's own recursion, since their phase against the
@@ -91,7 +91,6 @@ class PeriodicOptimum:
     """
 
     knowledge: ClassVar[Knowledge] = "clock"
-    stateless: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -117,9 +116,6 @@ class PeriodicOptimum:
             )
         steps = task.horizon if average == "episode" else None
         self.schedule, self.trace = optimum(task, packets, period, steps)
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Do nothing; the policy has no memory."""
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -222,10 +218,7 @@ def _search(task: Task, packets: int, period: int, steps: int | None) -> Schedul
         for number, selection in enumerate(part):
             schedules[list(selection), number] = True
         shaped = schedules.reshape(period, sensors, -1)
-        if steps is None:
-            traces = steady_traces(task, shaped)
-        else:
-            traces = episode_traces(task, shaped, steps)
+        traces = episode_traces(task, shaped, steps) if steps else steady_traces(task, shaped)
         first = int(np.flatnonzero(traces <= traces.min() * (1.0 + 1e-9))[0])
         if traces[first] < trace * (1.0 - 1e-9):
             best, trace = schedules[:, first].reshape(period, sensors), float(traces[first])

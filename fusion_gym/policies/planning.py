@@ -69,25 +69,20 @@ class PlanningModel:
         if self._task.packet == "estimate" and self._beliefs is not None:
             mean, covariance = self._beliefs.best
             updated = estimator.adopt(updated, mean[0], covariance[0], np.asarray(arriving.any(0)))
-        return _silent_path(estimator, updated, steps)
+        return self._silent_path(estimator, updated, steps)
 
     def best_means(self, steps: int) -> Array:
         """Return the predicted means (steps, n, N) of the best estimate, from all measurements."""
         estimator = self._task.memory_estimator
         if estimator is None or self._beliefs is None:
             return self.fused_means(np.ones((self._task.sensors, self.runs), np.bool_), steps)
-        return _silent_path(estimator, self._beliefs.memory_posterior, steps)
+        return self._silent_path(estimator, self._beliefs.memory_posterior, steps)
 
-
-def _silent_path(estimator: Estimator[Any], updated: Any, steps: int) -> Array:
-    """Return fused means (steps, n, N) without measurements and transmissions."""
-    means = [estimator.mean(updated)]
-    silence = None
-    for _ in range(steps - 1):
-        predicted = estimator.predict(updated)
-        if silence is None:
-            shape = len(predicted.measurement), means[0].shape[-1]
-            silence = Reception(np.zeros(shape, dtype=np.bool_))
-        updated = estimator.update(predicted, silence)
-        means.append(estimator.mean(updated))
-    return np.stack(means)
+    def _silent_path(self, estimator: Estimator[Any], updated: Any, steps: int) -> Array:
+        """Return fused means (steps, n, N) without measurements and transmissions."""
+        silence = Reception(np.zeros((self._task.sensors, self.runs), dtype=np.bool_))
+        means = [estimator.mean(updated)]
+        for _ in range(steps - 1):
+            updated = estimator.update(estimator.predict(updated), silence)
+            means.append(estimator.mean(updated))
+        return np.stack(means)

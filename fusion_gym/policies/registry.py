@@ -195,17 +195,18 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
     known = _parameters(name, maker)
     arguments: dict[str, Any] = {}
     if row.kind == "agent":
-        key, (value, *entries) = next(iter(known)), text.split(",")
-        arguments[key] = value.removeprefix(f"{key}=")
+        key, (first, *entries) = next(iter(known)), text.split(",")
+        arguments[key] = first.removeprefix(f"{key}=")
     else:
-        text, arguments = _split_rest(text, getattr(maker, "rest", None))
+        rest = getattr(maker, "rest", None)
+        if rest and (found := re.search(rf"(^|,)\s*{rest}=", text)):
+            text, arguments = text[: found.start()], {rest: text[found.end() :]}
         entries = text.split(",") if text else []
     settings = parse_settings(f"parameter of policy {name!r}", entries)
     keys(f"parameter of policy {name!r}", settings, known.keys() - arguments.keys())
     arguments |= defaults.get(name, {}) | settings
-    missing = [key for key, value in known.items() if value.default is value.empty]
-    for key in missing:
-        if key not in arguments:
+    for key, value in known.items():
+        if value.default is value.empty and key not in arguments:
             raise ConfigurationError(f"policy {spec!r} needs a parameter {key!r}: write {key}=…")
     parameters = inspect.signature(maker).parameters
     arguments |= {key: value for key, value in context.items() if key in parameters}
@@ -237,13 +238,6 @@ def _check_required(spec: str, policy: Any, task: Task, required: Any) -> None:
     raise refusal("policy", spec, allowed, "with filter='truncated'")
 
 
-def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:
-    """Return the text before the parameter ``rest``, and the value of that parameter."""
-    if rest is not None and (result := re.search(rf"(^|,)\s*{rest}=", text)):
-        return text[: result.start()], {rest: text[result.end() :]}
-    return text, {}
-
-
 def _parse_policy(spec: str) -> tuple[str, PolicyRow, str]:
     """Return the name of a policy, its row, and the text after its name."""
     if not isinstance(spec, str):
@@ -265,12 +259,10 @@ def _parse_policy(spec: str) -> tuple[str, PolicyRow, str]:
 
 
 def _maker(row: PolicyRow) -> Maker:
-    maker = row.maker
-    if isinstance(maker, str):
-        module, _, attribute = maker.partition(":")
-        member: Maker = getattr(importlib.import_module(module), attribute)
-        return member
-    return maker
+    if not isinstance(row.maker, str):
+        return row.maker
+    module, _, attribute = row.maker.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:

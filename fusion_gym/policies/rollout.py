@@ -11,7 +11,7 @@ from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, Requests, guard, is_stateless, owner_of
+from fusion_gym.policies.base import Policy, Requests, check_price, guard, owner_of
 from fusion_gym.policies.belief_rule import check_owner, knows
 from fusion_gym.policies.imagination import Imagination
 from fusion_gym.policies.registry import make_policy
@@ -90,15 +90,14 @@ class Rollout:
     ) -> None:
         self.samples = validation.integer("samples", samples, at_least=1, at_most=_SAMPLES)
         self.steps = validation.integer("steps", steps, at_least=1, at_most=_STEPS)
-        if price is not None:
-            validation.number("price", price, at_least=0.0)
+        check_price("price", price)
         self.price = price
         self.doubt = validation.number("doubt", doubt, at_least=0.0)
         check_owner(task, own=False)
         if not isinstance(base, str):
             raise validation.refusal("base", base, "the text that names a policy")
         self.base: Policy = make_policy(base, task, trust=trust)
-        if not is_stateless(self.base):
+        if not getattr(self.base, "stateless", False):
             why = "because simulated episodes call it"
             allowed = f"a policy that reads only signals of the present step, {why}"
             raise validation.refusal("base", base, allowed)
@@ -136,9 +135,7 @@ class Rollout:
     def _choices(self, own: Requests) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
         """Return first decisions (choices, sensors, N) and the number of the base's (N,)."""
         sensors, runs = own.shape
-        single = np.concatenate(
-            (np.zeros((1, sensors), dtype=np.bool_), np.eye(sensors, dtype=np.bool_))
-        )
+        single = np.eye(sensors + 1, sensors, k=-1, dtype=np.bool_)  # silence first
         choices = np.repeat(single[..., None], runs, axis=-1)
         several = own.sum(0) > 1
         if several.any():

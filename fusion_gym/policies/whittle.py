@@ -1,7 +1,5 @@
 """Whittle's index of remote estimation: the value of a transmission of each single source."""
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,12 +7,12 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests, check_at_most, strongest
+from fusion_gym.policies.base import Requests, Stateless, check_at_most, strongest
 from fusion_gym.solvers.task import source_problems
 from fusion_gym.solvers.whittle import index_table
 
 
-class WhittleIndex:
+class WhittleIndex(Stateless):
     r"""Request the sources whose Whittle index reaches the price of a transmission.
 
     The index of a source with error e and channel state s is the price λ at which transmission and
@@ -53,8 +51,6 @@ class WhittleIndex:
     Example: ``whittle:price=5`` in ``fusion_gym/RemoteEstimation-v1 sensors=2 cost_weight=5.0``.
     """
 
-    stateless: ClassVar[bool] = True
-
     def __init__(self, task: Task, price: float | None = None, at_most: int | None = None) -> None:
         check_at_most("at_most", at_most)
         problems = source_problems(task)
@@ -68,9 +64,6 @@ class WhittleIndex:
     def knowledge(self) -> Knowledge:
         """The class of a sensor, or with ``at_most``, which compares sources, of a scheduler."""
         return "own" if self._at_most is None else "scheduler"
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Do nothing; the policy has no memory."""
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""

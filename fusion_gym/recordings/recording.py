@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -347,7 +348,4 @@ def _with_limits(
 
 def _runs(values: Any) -> list[tuple[Any, int]]:
     """Return the values of runs of equal entries, and their lengths."""
-    array = np.asarray(values)
-    starts = np.flatnonzero(np.concatenate([[True], array[1:] != array[:-1]]))
-    lengths = np.diff(np.append(starts, len(array)))
-    return list(zip(array[starts].tolist(), lengths.tolist(), strict=True))
+    return [(value, len(list(same))) for value, same in groupby(np.asarray(values).tolist())]

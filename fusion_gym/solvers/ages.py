@@ -30,13 +30,6 @@ class AgeSolution:
     choice: NDArray[np.int64]
 
 
-def silent_variances(problem: SourceProblem, longest: int) -> Array:
-    """Return the variances of errors of the ages k = 1, 2, …: σ² (1 + a² + … + a^(2(k-1)))."""
-    with np.errstate(over="ignore"):
-        powers = problem.coefficient ** (2.0 * np.arange(longest))
-    return problem.deviation**2 * np.cumsum(powers)
-
-
 def solve_ages(
     problems: tuple[SourceProblem, ...], at_most: int | None = None, longest: int | None = None
 ) -> AgeSolution:
@@ -57,9 +50,8 @@ def solve_ages(
     count = len(problems)
     limit = count if at_most is None else validation.integer("at_most", at_most, at_least=1)
     if any(len(problem.drop) > 1 for problem in problems):
-        where = "for the best schedule by ages"
         reason = "the channel must lose packets independently"
-        raise forbidden("channel", "gilbert_elliott", reason, where)
+        raise forbidden("channel", "gilbert_elliott", reason, "for the best schedule by ages")
     size = longest or max(_default_length(problem, count / limit) for problem in problems)
     if max(size, 2) ** count > _MOST_STATES:
         raise ConfigurationError(
@@ -91,7 +83,10 @@ def _step_cost(problems: tuple[SourceProblem, ...], size: int, choice: int) -> A
     """Return the expected cost (A, ..., A) of a step in which the sources ``choice`` transmit."""
     total = np.zeros((size,) * len(problems))
     for i, problem in enumerate(problems):
-        cost = problem.error_weight * silent_variances(problem, size)
+        # The errors of the ages k have the variances σ² (1 + a² + … + a^(2(k-1))).
+        with np.errstate(over="ignore"):
+            powers = problem.coefficient ** (2.0 * np.arange(size))
+        cost = problem.error_weight * (problem.deviation**2 * np.cumsum(powers))
         if choice >> i & 1:
             cost = problem.price + problem.drop[0] * cost
         shape = [1] * len(problems)

@@ -74,7 +74,7 @@ def lagrangian_bound(
 
     high = max(problem.price / cost for problem, cost in zip(problems, costs, strict=True))
     high = max(high, min(p.error_weight * p.deviation**2 for p in problems))
-    best = dual(0.0)
+    best = zero = dual(0.0)
     for _ in range(_DOUBLINGS):
         value = dual(high)
         if value < best:
@@ -86,7 +86,6 @@ def lagrangian_bound(
         method="bounded",
         options={"xatol": _TOLERANCE * high},
     )
-    zero = dual(0.0)
     if zero >= -float(optimum.fun):
         return DualBound(zero, 0.0)
     return DualBound(float(-optimum.fun), float(np.asarray(optimum.x)))

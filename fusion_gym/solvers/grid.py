@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri
 
 from fusion_gym.arrays import Array
 
@@ -44,37 +43,3 @@ def gaussian_rows(mean: Array, deviation: float, points: Array) -> Array:
     rows *= scale
     rows[:, -1] += np.maximum(1.0 - rows.sum(1), 0.0)
     return rows / rows.sum(1, keepdims=True)
-
-
-def silent_deviation(coefficient: float, deviation: float, steps: float) -> float:
-    """Return the error's deviation after silent steps: σ √(1 + a² + … + a^(2(steps-1)))."""
-    square = coefficient**2
-    if abs(square - 1.0) < 1e-9:
-        return float(deviation * np.sqrt(steps))
-    with np.errstate(over="ignore"):
-        growth = np.expm1(steps * np.log(max(square, 1e-300))) / (square - 1.0)
-    return float(deviation * np.sqrt(growth))
-
-
-def default_reach(
-    coefficient: float,
-    deviation: float,
-    threshold: float,
-    transition: Array,
-    drop: Array,
-    wait: float,
-    horizon: int | None,
-    negligible: float,
-) -> float:
-    """Return an error that is exceeded with a ``negligible`` probability."""
-    tails = -float(ndtri(0.5 * negligible))
-    persistence = float(np.abs(np.linalg.eigvals(transition * drop)).max())
-    losses = np.inf if persistence >= 1.0 else 0.0
-    if 0.0 < persistence < 1.0:
-        losses = np.log(negligible) / np.log(persistence)
-    steps = min((1.0 + losses) * wait + 1.0, np.inf if horizon is None else horizon, 4000.0)
-    reach = threshold + tails * silent_deviation(coefficient, deviation, steps)
-    if horizon is not None:
-        longest = tails * silent_deviation(coefficient, deviation, float(horizon))
-        reach = min(reach, longest)
-    return float(min(reach, 1e6 * deviation))

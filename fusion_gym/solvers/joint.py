@@ -11,7 +11,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.errors import forbidden
-from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
+from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.iteration import iterate_values
 from fusion_gym.solvers.source import Resolution, SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
@@ -45,9 +45,8 @@ class JointProblem:
             raise validation.refusal("sensors", len(sources), "2", "for the joint optimum")
         first, second = sources
         if len(first.drop) > 1 or len(second.drop) > 1:
-            where = "for the joint optimum"
             reason = "the channel must lose packets independently"
-            raise forbidden("channel", "gilbert_elliott", reason, where)
+            raise forbidden("channel", "gilbert_elliott", reason, "for the joint optimum")
         if bucket is None:
             bucket = TokenBucket.create(1.0, 2.0, 2.0, 1.0, sensors=2, unlimited=True)
         limit = validation.integer("at_most", at_most, at_least=1, at_most=2)
@@ -61,17 +60,10 @@ class JointProblem:
 
     def grids(self, horizon: int | None = None) -> tuple[ErrorGrid, ErrorGrid]:
         """Return a grid for each source's error, coarser than the grid of one source."""
-        tokens = self.tokens
-        wait = 2.0 / self.at_most
-        if len(tokens.level) > 1:
-            rate = float((tokens.level[tokens.following[:, 0]] - tokens.level).max())
-            wait = max(wait, float(tokens.spent[3]) / max(rate, 1e-12))
-        resolution = _RESOLUTION if len(tokens.level) == 1 else _RESOLUTION_TOKENS
-        first, second = self.sources
-        return (
-            first.grid(horizon, wait=wait, resolution=resolution),
-            second.grid(horizon, wait=wait, resolution=resolution),
-        )
+        wait = max(2.0 / self.at_most, self.tokens.wait)
+        resolution = _RESOLUTION if len(self.tokens.level) == 1 else _RESOLUTION_TOKENS
+        first, second = (s.grid(horizon, wait=wait, resolution=resolution) for s in self.sources)
+        return first, second
 
 
 class JointBellman:
@@ -153,6 +145,5 @@ def solve_joint_finite(
         value, choices[step] = bellman.decide(value)
     value = value[..., problem.tokens.initial]
     for source, grid, spread in zip(problem.sources, bellman.grids, initial_deviation, strict=True):
-        deviation = float(np.hypot(source.coefficient * spread, source.deviation))
-        value = gaussian_rows(np.zeros(1), deviation, grid.points)[0] @ value
+        value = source.first_law(grid, spread) @ value
     return JointFiniteSolution(float(value), choices, bellman.grids)

@@ -11,7 +11,7 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
+from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.iteration import iterate_values
 from fusion_gym.solvers.source import SourceProblem
 
@@ -245,8 +245,7 @@ def solve_finite(
         values[step], here = source_thresholds(advantage, bellman.grid.points)
         sent = bellman.count(sent, values[step])
         ordered = ordered and here
-    deviation = float(np.hypot(problem.coefficient * spread, problem.deviation))
-    first = gaussian_rows(np.zeros(1), deviation, bellman.grid.points)[0]
+    first = problem.first_law(bellman.grid, spread)
     cost = float(first @ value[..., problem.tokens.initial] @ problem.initial)
     rate = float(first @ sent[..., problem.tokens.initial] @ problem.initial) / steps
     error = (cost / steps - problem.price * rate) / problem.error_weight

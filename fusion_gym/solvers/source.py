@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import ndtri
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
-from fusion_gym.solvers.grid import ErrorGrid, default_reach
+from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
 from fusion_gym.solvers.tokens import TokenLevels
 
 
@@ -93,25 +94,9 @@ class SourceProblem:
             tokens=TokenLevels.create(bucket),
         )
 
-    @property
-    def scale(self) -> float:
-        """The optimal threshold in continuous time for a = 1: (6 price/w)^¼ σ^½."""
-        return float((6.0 * self.price / self.error_weight) ** 0.25 * self.deviation**0.5)
-
-    @property
-    def wait(self) -> float:
-        """Steps between two transmissions that the tokens can sustain, at least 1."""
-        tokens = self.tokens
-        if len(tokens.level) == 1:
-            return 1.0
-        rate = float((tokens.level[tokens.following[:, 0]] - tokens.level).max())
-        return max(1.0, float(tokens.spent[1]) / max(rate, 1e-12))
-
     def grid(
         self,
         horizon: int | None = None,
-        reach: float | None = None,
-        step: float | None = None,
         wait: float | None = None,
         resolution: Resolution | None = None,
     ) -> ErrorGrid:
@@ -122,31 +107,46 @@ class SourceProblem:
 
         Args:
             horizon: number of steps; None for no end.
-            reach: largest error.
-            step: distance of the points.
-            wait: steps between two transmissions; the source's ``wait`` by default.
+            wait: steps between two transmissions; by default those that the tokens can sustain.
             resolution: resolution of the default grid.
         """
         if resolution is None:
             resolution = _RESOLUTION if len(self.tokens.level) == 1 else _RESOLUTION_TOKENS
-        if reach is None:
-            wait = self.wait if wait is None else wait
-            threshold = max(self.scale, self.deviation * float(np.sqrt(wait)))
-            reach = default_reach(
-                self.coefficient,
-                self.deviation,
-                threshold,
-                self.transition,
-                self.drop,
-                wait,
-                horizon,
-                resolution.negligible,
-            )
-        if step is None:
-            finest = self.deviation / resolution.finest
-            coarsest = self.deviation / resolution.coarsest
-            step = min(max(reach / resolution.points, finest), coarsest)
+        wait = max(1.0, self.tokens.wait) if wait is None else wait
+        reach = self._reach(wait, horizon, resolution.negligible)
+        finest, coarsest = (self.deviation / n for n in (resolution.finest, resolution.coarsest))
+        step = min(max(reach / resolution.points, finest), coarsest)
         return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
+
+    def _reach(self, wait: float, horizon: int | None, negligible: float) -> float:
+        """Return an error that is exceeded with a ``negligible`` probability."""
+        tails = -float(ndtri(0.5 * negligible))
+        persistence = float(np.abs(np.linalg.eigvals(self.transition * self.drop)).max())
+        losses = np.inf if persistence >= 1.0 else 0.0
+        if 0.0 < persistence < 1.0:
+            losses = np.log(negligible) / np.log(persistence)
+        steps = min((1.0 + losses) * wait + 1.0, np.inf if horizon is None else horizon, 4000.0)
+        # The optimal threshold in continuous time for a = 1.
+        scale = float((6.0 * self.price / self.error_weight) ** 0.25 * self.deviation**0.5)
+        threshold = max(scale, self.deviation * float(np.sqrt(wait)))
+        reach = threshold + tails * self._silent_deviation(steps)
+        if horizon is not None:
+            reach = min(reach, tails * self._silent_deviation(float(horizon)))
+        return float(min(reach, 1e6 * self.deviation))
+
+    def _silent_deviation(self, steps: float) -> float:
+        """Return the error's deviation after silent steps: σ √(1 + a² + … + a^(2(steps-1)))."""
+        square = self.coefficient**2
+        if abs(square - 1.0) < 1e-9:
+            return float(self.deviation * np.sqrt(steps))
+        with np.errstate(over="ignore"):
+            growth = np.expm1(steps * np.log(max(square, 1e-300))) / (square - 1.0)
+        return float(self.deviation * np.sqrt(growth))
+
+    def first_law(self, grid: ErrorGrid, spread: float) -> Array:
+        """Return the law (M,) of the first error on a grid, from the deviation of x(0)."""
+        deviation = float(np.hypot(self.coefficient * spread, self.deviation))
+        return gaussian_rows(np.zeros(1), deviation, grid.points)[0]
 
 
 def _initial_law(transition: Array, values: ArrayLike | None) -> Array:

@@ -56,11 +56,12 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     Raises:
         ConfigurationError: another system, a drawn price, or a reward without the squared error.
     """
-    system, channel, reward = _sources(task), _channel(task), task.reward
+    system, channel, reward = _sources(task), task.network.channel, task.reward
     if reward.error != "squared":
         raise validation.refusal("error", reward.error_kind, "'squared'", "for the optimum")
     if reward.price.fixed is None:
         raise validation.refusal("cost_weight", "random", "a number", "for the optimum")
+    channel = channel or Channel.perfect(task.sensors)
     weights = reward.error_weight * reward.state_weights[:, 0]
     return tuple(
         SourceProblem.create(
@@ -74,11 +75,6 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
         )
         for i in range(system.sensor_count)
     )
-
-
-def _channel(task: Task) -> Channel:
-    """Return the losses of the task's network."""
-    return task.network.channel or Channel.perfect(task.sensors)
 
 
 def _sources(task: Task) -> ScalarSources:
@@ -108,30 +104,26 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
         return _solve_pair(task, problems, criterion)
     # Several independent sources have unlimited tokens, of one level.
     tokens = TokenLevels.create(bucket) if single else problems[0].tokens
-    costs, errors, rates, result = [], [], [], []
+    solutions: list[AverageSolution | FiniteSolution] = []
     for i, priced in enumerate(problems):
         problem = replace(priced, tokens=tokens) if single else priced
-        solution: AverageSolution | FiniteSolution
         if criterion == "average":
-            solution = solve_average(problem)
+            solutions.append(solve_average(problem))
         else:
-            system = _sources(task)
-            spread = float(system.initial_deviation[i])
-            solution = solve_finite(problem, task.horizon, spread)
-        if not solution.ordered:
+            spread = float(_sources(task).initial_deviation[i])
+            solutions.append(solve_finite(problem, task.horizon, spread))
+        if not solutions[-1].ordered:
             raise ConfigurationError(
                 "this task is not solved: its optimum has no thresholds on the error"
             )
-        costs.append(solution.cost)
-        errors.append(problem.error_weight * solution.error)
-        rates.append(solution.rate)
-        result.append(solution.threshold.reshape(-1, *solution.threshold.shape[-2:]))
+    thresholds = [one.threshold.reshape(-1, *one.threshold.shape[-2:]) for one in solutions]
+    pairs = zip(problems, solutions, strict=True)
     return Optimum(
-        cost=sum(costs),
-        error=sum(errors),
-        rate=sum(rates),
+        cost=sum(one.cost for one in solutions),
+        error=sum(problem.error_weight * one.error for problem, one in pairs),
+        rate=sum(one.rate for one in solutions),
         tokens=tokens,
-        threshold=np.stack(result, axis=1),
+        threshold=np.stack(thresholds, axis=1),
     )
 
 
@@ -140,10 +132,8 @@ def _solve_pair(task: Task, problems: tuple[SourceProblem, ...], criterion: str)
         where = "for the optimum under limited tokens or access"
         raise validation.refusal("sensors", len(problems), "1 or 2", where)
     if task.network.access not in ("any", "single"):
-        allowed = "'any' or 'single'"
-        raise validation.refusal(
-            "access", task.network.access, allowed, "for the optimum of two sources"
-        )
+        where = "for the optimum of two sources"
+        raise validation.refusal("access", task.network.access, "'any' or 'single'", where)
     at_most = 1 if task.network.access == "single" else 2
     problem = JointProblem.create(problems, task.network.bucket, at_most)
     if criterion == "average":

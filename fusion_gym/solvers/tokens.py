@@ -76,6 +76,14 @@ class TokenLevels:
         initial = int(np.searchsorted(level, round(start, _DIGITS) - 10.0**-_DIGITS))
         return cls(level, initial, affordable, after.reshape(shape), spent)
 
+    @property
+    def wait(self) -> float:
+        """Steps for which the tokens of all sensors are saved; 0 for unlimited tokens."""
+        if len(self.level) == 1:
+            return 0.0
+        rate = float((self.level[self.following[:, 0]] - self.level).max())
+        return float(self.spent[-1]) / max(rate, 1e-12)
+
     def index(self, tokens: Array) -> NDArray[np.int64]:
         """Return the index of each level in ``tokens`` (N,)."""
         if len(self.level) == 1:

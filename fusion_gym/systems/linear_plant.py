@@ -25,6 +25,16 @@ def covariance_factor(matrix: Array) -> Array:
     return np.ascontiguousarray(factor[:, factor.any(0)])
 
 
+def initial_law(mean: ArrayLike, covariance: ArrayLike, size: int) -> dict[str, Array]:
+    """Return the checked mean, covariance and factor of x(0), by field of a plant."""
+    start = validation.covariance("initial_covariance", covariance, size)[..., None]
+    return {
+        "initial_mean": validation.array("initial_mean", mean, (size,))[..., None],
+        "initial_covariance": start,
+        "initial_factor": linalg.root(start),
+    }
+
+
 class Sensors:
     """The common part of linear sensors: C (sensors, m, n, 1), a noise for each component."""
 
@@ -131,14 +141,11 @@ class LinearPlant(LinearDynamics):
         matrix = validation.square("transition", transition)
         size = len(matrix)
         process = validation.covariance("process_covariance", process_covariance, size)
-        start = validation.covariance("initial_covariance", initial_covariance, size)
         return cls(
             transition=matrix[..., None],
             process_covariance=process[..., None],
             process_factor=covariance_factor(process)[..., None],
-            initial_mean=validation.array("initial_mean", initial_mean, (size,))[..., None],
-            initial_covariance=start[..., None],
-            initial_factor=linalg.root(start[..., None]),
+            **initial_law(initial_mean, initial_covariance, size),
         )
 
     def start(self, mean: Array, noise: Array) -> Array:

@@ -5,47 +5,36 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Estimator, Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    Block,
-    age_block,
-    common_signals,
-    log_deviation,
-    numbered,
+from fusion_gym.core.estimator import Reception, SignalValues
+from fusion_gym.core.knowledge import Block, age_block, common_signals, log_deviation, numbered
+from fusion_gym.systems.parts import (
+    RANGE,
+    AdoptingEstimator,
+    Deliveries,
+    NormalPlant,
+    Truth,
+    prior_block,
+    variance_block,
 )
-from fusion_gym.core.plant import Plant
 
 _RUNS = 1000  # that tell what happens without transmissions
 _SEED = 20_240_229  # of their noise
-_RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
 
 
 @dataclass(slots=True)
-class NonlinearTruth:
-    """The true state ``truth`` (n, N), and the ``measurement`` (l, m, N)."""
+class FilteredEstimate(Deliveries):
+    """The estimate of N runs at one time; n states.
 
-    truth: Array
-    measurement: Array
-
-
-@dataclass(slots=True)
-class FilteredEstimate:
-    """The estimate of N runs at one time; n states, l sensors of m channels.
-
-    ``measurement`` and ``held``, the last delivered one, (l, m, N) · ``age`` (l, N) ·
-    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the
-    posterior.
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the posterior.
     """
 
-    measurement: Array
-    held: Array
-    age: Array
     prior_mean: Array
     prior_covariance: Array
     mean: Array
@@ -192,7 +181,7 @@ class NonlinearSystem(ABC):
         return moment / horizon, error / horizon
 
 
-class NonlinearPlant(Plant[NonlinearTruth]):
+class NonlinearPlant(NormalPlant):
     """The truth of a :class:`NonlinearSystem`."""
 
     def __init__(self, system: NonlinearSystem) -> None:
@@ -213,36 +202,25 @@ class NonlinearPlant(Plant[NonlinearTruth]):
         """Normals of a start: state, then first measurement."""
         return len(self.state_names) + self.system.sensors * self.system.channels
 
-    def start(self, noise: Array) -> tuple[NonlinearTruth, None]:
+    def start(self, noise: Array) -> tuple[Truth, None]:
         """Draw the initial state, and measure."""
         size, system = len(self.state_names), self.system
         mean = np.repeat(system.initial_mean[:, None], noise.shape[-1], axis=1)
         truth = mean + linalg.root(system.initial_covariance[..., None])[..., 0] @ noise[:size]
-        return NonlinearTruth(truth, system.measured(truth, noise[size:])), None
+        return Truth(truth, system.measured(truth, noise[size:]), None), None
 
-    def sense(self, state: NonlinearTruth, noise: Array) -> NonlinearTruth:
+    def sense(self, state: Truth, noise: Array) -> Truth:
         """Move the plant, and measure."""
         own = self.system.process_channels
         truth = self.system.move(state.truth, noise[:own])
-        return NonlinearTruth(truth, self.system.measured(truth, noise[own:]))
-
-    @property
-    def draw_channels(self) -> int:
-        """Number of states."""
-        return len(self.state_names)
-
-    def draw(
-        self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
-    ) -> NonlinearTruth:
-        """Draw the truth from N(mean, covariance)."""
-        return NonlinearTruth(linalg.draw_normal(mean, covariance, noise), measurement)
+        return Truth(truth, self.system.measured(truth, noise[own:]), None)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""
         return self.system.silence(horizon)[1]
 
 
-class NonlinearEstimator(Estimator[FilteredEstimate]):
+class NonlinearEstimator(AdoptingEstimator[FilteredEstimate]):
     """The filter of a :class:`NonlinearSystem`, at the centre."""
 
     signals = common_signals()
@@ -253,45 +231,28 @@ class NonlinearEstimator(Estimator[FilteredEstimate]):
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes, entries = numbered(self.system.sensors), numbered(self.system.channels)
+        nodes, names = numbered(self.system.sensors), self.system.state_names
+        labels, (magnitude, reference) = (
+            (nodes, numbered(self.system.channels)),
+            self.system.typical,
+        )
+        new = partial(Block, labels=labels, knowledge="own", node="own", limit=RANGE)
         return (
-            Block(
+            new(
                 "whitened_innovation",
                 "innovation over its predicted deviation",
                 lambda s: (s.measurement - self._expected(s)) / self._deviation(s),
-                (nodes, entries),
-                knowledge="own",
-                node="own",
-                limit=_RANGE,
             ),
-            Block(
+            new(
                 "held_difference",
                 "new minus last delivered measurement, over twice the innovation's deviation",
                 lambda s: (s.measurement - s.held) / (2.0 * self._deviation(s)),
-                (nodes, entries),
-                knowledge="own",
-                node="own",
-                limit=_RANGE,
             ),
             age_block(nodes),
-            Block(
-                "log_variance",
-                "logarithm of the predicted variance over its open-loop mean",
-                lambda s: 2.0 * log_deviation(s.prior_covariance, self.system.typical[1]),
-                (self.system.state_names,),
-                node="broadcast",
-                limit=_RANGE,
-                constants={"open-loop mean": self.system.typical[1]},
+            variance_block(
+                lambda s: 2.0 * log_deviation(s.prior_covariance, reference), names, reference
             ),
-            Block(
-                "estimate",
-                "prediction over the state's root mean square",
-                lambda s: s.prior_mean / self.system.typical[0][:, None],
-                (self.system.state_names,),
-                node="broadcast",
-                limit=_RANGE,
-                constants={"root mean square": self.system.typical[0]},
-            ),
+            prior_block(names, magnitude),
         )
 
     def start(self, measurement: Array, announcement: None) -> FilteredEstimate:
@@ -312,10 +273,6 @@ class NonlinearEstimator(Estimator[FilteredEstimate]):
             prior_covariance=linalg.symmetrise(covariance),
         )
 
-    def observe(self, state: FilteredEstimate, measurement: Array) -> FilteredEstimate:
-        """Take the measurement."""
-        return replace(state, measurement=measurement)
-
     def update(self, state: FilteredEstimate, reception: Reception) -> FilteredEstimate:
         """Update the centre with the measurements that arrive, sensor by sensor."""
         mean, covariance, arrived = state.prior_mean, state.prior_covariance, reception.arrived
@@ -334,31 +291,13 @@ class NonlinearEstimator(Estimator[FilteredEstimate]):
     def read(self, state: FilteredEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals."""
         return {
-            "measurement": state.measurement,
+            **super().read(state, failure),
             "innovation": lambda: state.measurement - self._expected(state),
-            "held": state.held,
-            "age": state.age,
             "expected_measurement": lambda: self._expected(state),
             "innovation_deviation": lambda: self._deviation(state),
-            "prior_mean": state.prior_mean,
-            "prior_covariance": state.prior_covariance,
             "silent_variance": lambda: linalg.trace(state.prior_covariance),
             "variance_reduction": lambda: self._reduction(state),
         }
-
-    def adopt(
-        self, state: FilteredEstimate, mean: Array, covariance: Array, runs: NDArray[np.bool_]
-    ) -> FilteredEstimate:
-        """Replace the centre's estimate in ``runs`` (N,)."""
-        return replace(
-            state,
-            mean=np.where(runs, mean, state.mean),
-            covariance=np.where(runs, covariance, state.covariance),
-        )
-
-    def local_means(self, state: FilteredEstimate) -> Array:
-        """Return the centre's mean for every sensor (l, n, N); the system has no nodes."""
-        return np.broadcast_to(state.mean, (self.system.sensors, *state.mean.shape))
 
     def _expected(self, state: FilteredEstimate) -> Array:
         shape = (self.system.sensors * self.system.channels, state.prior_mean.shape[-1])

@@ -64,12 +64,10 @@ class Silence:
             ConfigurationError: an option is missing or not allowed, or a sensor has several
                 channels and the trigger is not ``report_on_change``.
         """
-        where = "with filter='truncated'"
-        for name, value in (("trigger", trigger), ("trigger_threshold", threshold)):
-            if value is None:
-                allowed = "that of the policy whose silence the filter reads"
-                raise refusal(name, None, allowed, where)
-        assert trigger is not None
+        if trigger is None or threshold is None:
+            missing = "trigger" if trigger is None else "trigger_threshold"
+            allowed = "that of the policy whose silence the filter reads"
+            raise refusal(missing, None, allowed, "with filter='truncated'")
         if channels > 1 and trigger != "report_on_change":
             raise refusal("trigger", trigger, "'report_on_change'", "for several channels")
         checked = validation.not_negative("trigger_threshold", threshold, (sensors,))

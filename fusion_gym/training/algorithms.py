@@ -43,7 +43,8 @@ class AlgorithmConfig(Strict):
         import torch
         from stable_baselines3.common.utils import LinearSchedule
 
-        value = self.model_dump(exclude={"name", "learning_rate_end", "network"})
+        ours = {"name", "learning_rate_end", "network", "initial_rate"}
+        value = self.model_dump(exclude=ours)
         if self.learning_rate_end is not None:
             value["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
         activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.network.activation]
@@ -60,12 +61,6 @@ class A2CConfig(AlgorithmConfig):
     max_grad_norm: Rate = 0.5
     initial_rate: InitialRate = None
     n_steps: Positive = 8
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the arguments of the algorithm's class, without the initial rate of the policy."""
-        result = super().arguments()
-        del result["initial_rate"]
-        return result
 
 
 class PPOConfig(A2CConfig):

@@ -20,9 +20,11 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.output.files import DAMAGED, replacing
+from fusion_gym.output.files import replacing
+from fusion_gym.policies.archive import DAMAGE
 from fusion_gym.validation import ConfigurationError
 
+DAMAGED = (*DAMAGE, KeyError, TypeError, ValueError)  # errors from a damaged checkpoint
 # Additional entries of the archive.
 _JOURNAL, _STATE, _BEST = "journal.json", "state.pkl", "best_model.zip"
 # Attributes that Stable-Baselines3 does not save: replay buffer and recurrent memory.
@@ -72,8 +74,7 @@ def read_journal(path: Path) -> Journal:
     """Return the journal of a checkpoint after a check of all checksums, without unpickling."""
     try:
         with zipfile.ZipFile(path) as archive:
-            broken = archive.testzip()
-            if broken is not None:
+            if broken := archive.testzip():
                 raise zipfile.BadZipFile(f"{broken} is damaged")
             content = json.loads(archive.read(_JOURNAL))
             best = archive.read(_BEST) if _BEST in archive.namelist() else None

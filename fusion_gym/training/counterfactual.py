@@ -133,10 +133,11 @@ class Counterfactual(OnPolicyAlgorithm):
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            follows = np.array(after)
+            follows, terminated = np.array(after), dones.copy()
             for row in np.flatnonzero(dones):
                 follows[row] = infos[row]["terminal_observation"]
-            goes_on = ~_terminated(dones, infos)[first]
+                terminated[row] = not infos[row]["TimeLimit.truncated"]
+            goes_on = ~terminated[first]
             beyond = goes_on * self._beyond(branched.observation)
             value = goes_on * self._value(decisions.by_run(follows))
             taken = rewards[first] + self.gamma * value
@@ -154,8 +155,7 @@ class Counterfactual(OnPolicyAlgorithm):
         values = [self._value(step.observation.numpy()) for step in steps]
         advantages, surplus, returns = [], [], []
         ahead = np.zeros(len(steps[0].dones))
-        for place in range(len(steps) - 1, -1, -1):
-            step = steps[place]
+        for place, step in reversed(list(enumerate(steps))):
             mean = (np.exp(step.old.numpy()) * step.values).sum(-1)
             left = np.zeros_like(ahead)
             if place + 1 < len(steps):
@@ -327,14 +327,6 @@ class _Step(NamedTuple):
     values: Array
     follows: Array
     dones: NDArray[np.bool_]
-
-
-def _terminated(dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> NDArray[np.bool_]:
-    """Return the rows whose episode has terminated without truncation, so no value follows."""
-    result = dones.copy()
-    for row in np.flatnonzero(dones):
-        result[row] = not infos[row]["TimeLimit.truncated"]
-    return result
 
 
 def _privileged(env: Any) -> PrivilegedVecEnv:

@@ -54,24 +54,20 @@ class Decisions:
         self.choices = 2
         if self.kind == "all":
             self.choices = 2**self.sensors if self.binary else int(space.n)  # type: ignore[attr-defined]
-            self._check_choices()
+            if self.choices > 2**MOST_SENSORS:
+                text, instead = "action = 'discrete'", "action must be 'binary'"
+                if self.binary:
+                    text, instead = "alternatives = 'all'", "it must be 'flips'"
+                raise ConfigurationError(
+                    f"{text} is not allowed here with {self.sensors} sensors: it steps all "
+                    f"2^{self.sensors} sets of requests of at most {MOST_SENSORS} sensors; "
+                    f"{instead}"
+                )
             numbers = np.arange(self.choices)
             bits = (numbers[:, None] >> np.arange(self.sensors) & 1).astype(np.bool_)
             actions = bits if self.binary else numbers
             self.bits = torch.as_tensor(bits, dtype=torch.float32)
             self.requests = env.view.requests(actions, self.choices).T[:, :, None]
-
-    def _check_choices(self) -> None:
-        """Refuse more sets of requests than 2^10."""
-        if self.choices <= 2**MOST_SENSORS:
-            return
-        text, instead = ("action = 'discrete'", "action must be 'binary'")
-        if self.binary:
-            text, instead = ("alternatives = 'all'", "it must be 'flips'")
-        raise ConfigurationError(
-            f"{text} is not allowed here with {self.sensors} sensors: it steps all "
-            f"2^{self.sensors} sets of requests of at most {MOST_SENSORS} sensors; {instead}"
-        )
 
     def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:
         """Return the log-probabilities of all choices (runs, D, C).

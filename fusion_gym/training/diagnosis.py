@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from fusion_gym.arrays import Array
 from fusion_gym.core.scale import sustained_tokens
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.policy_batch import run_priced
+from fusion_gym.evaluation.episodes import run_priced
 from fusion_gym.evaluation.rule_search import class_of, search_of_class
 from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy
@@ -63,7 +63,7 @@ def validation_prices(task: Task) -> tuple[float, ...]:
     """Return the prices of a validation: of a drawn price the range, else the task's own."""
     price = task.reward.price
     if price.fixed is not None or price.span is None:
-        return tuple(price.draw(np.array([0.5])).tolist())
+        return (price.middle,)
     return tuple(np.geomspace(*price.span, PRICES).tolist())
 
 
@@ -78,7 +78,7 @@ def run_at_prices(
         policy = ModelPolicy(model, task, deterministic, trained=ModelView(local=local))
         means = run_priced(task, policy, seeds, each)
         columns += [means.cost(each), means.tokens, means.mse]
-        columns += [means.rate] if deterministic else []
+        columns += [means.rate.mean(-1)] if deterministic else []
     rows = zip(
         *(column.reshape(len(prices), -1).mean(1).tolist() for column in columns), strict=True
     )

@@ -125,8 +125,7 @@ def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
     """Print the largest cross term of two usual policies if its interval excludes zero."""
     task, reference = env.task, env.batch.reference
     assert reference is not None  # present in the environment of such a training
-    begins = getattr(experiment.algorithm, "initial_rate", None)
-    rate = begins or 0.5
+    rate = getattr(experiment.algorithm, "initial_rate", None) or 0.5
     policies = {name: make_policy(name, task) for name in usual_policies(task, rate)}
     name, terms = worst(cross_terms(task, reference, policies, _EPISODES, _SEED, _LEVEL))
     if not terms.compatible:

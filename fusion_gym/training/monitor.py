@@ -41,10 +41,8 @@ class Interrupt:
 
     def __enter__(self) -> Interrupt:
         mine = threading.current_thread() is threading.main_thread()
-        self._before = {
-            number: signal.signal(number, self._raise)
-            for number in ((signal.SIGINT, signal.SIGTERM) if mine else ())
-        }
+        numbers = (signal.SIGINT, signal.SIGTERM) if mine else ()
+        self._before = {number: signal.signal(number, self._raise) for number in numbers}
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pydantic
 
 from fusion_gym.core.reward import Price
@@ -24,7 +23,7 @@ class SweepCurve(Strict):
     def policies(self, price: Price) -> list[str]:
         """Return one policy text per value."""
         name = "{price}" if "{price}" in self.policy else "{value}"
-        middle = float(price.draw(np.array([0.5]))[0]) if name == "{price}" else 1.0
+        middle = price.middle if name == "{price}" else 1.0
         return [self.policy.replace(name, f"{middle * value:g}") for value in self.values]
 
     @pydantic.field_validator("policy")

@@ -41,5 +41,4 @@ class LocalVariance(Rule):
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         variance = signals["local_variance"]
-        result: Requests = variance >= self.reference + self.column("m", len(variance))
-        return result
+        return variance >= self.reference + self.column("m", len(variance))

@@ -121,17 +121,13 @@ class PricedThreshold(BeliefRule):
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
-        result: Requests = self.log_ratio(signals) >= 0.0
-        return result
+        return self.log_ratio(signals) >= 0.0
 
     def log_ratio(self, signals: Signals) -> Array:
         """Return ln r - k ln max{1, s (p/p0)^μ} (sensors, N); a request is at least 0."""
         value, loss = self._scores(signals)
-        numbers, bucket, age = (
-            self.numbers,
-            self.task.network.bucket,
-            np.maximum(signals["age"], 0.0),
-        )
+        numbers, bucket = self.numbers, self.task.network.bucket
+        age = np.maximum(signals["age"], 0.0)
         price = signals["price"] if self.price is None else np.asarray(self.price)
         tokens = (signals["tokens"] + 1.0) / (bucket.capacity + 1.0)
         price = price / self.reference_price

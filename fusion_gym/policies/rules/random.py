@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from fusion_gym.core.knowledge import Knowledge, Signals
-from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, parameter, shape_of
-from fusion_gym.policies.chance import Chance
-
-_STREAM = 0x72616E646F6D  # makes requests independent of the noise of the same seed
+from fusion_gym.policies.base import PerSensor, Requests, each_number, parameter, shape_of
+from fusion_gym.policies.chance import ChanceRule
 
 
 @dataclass
-class Random(Rule):
+class Random(ChanceRule):
     r"""Request each sensor with probability ``rate``, independently at every step.
 
     Args:
@@ -34,16 +32,9 @@ class Random(Rule):
 
     rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)
     knowledge: ClassVar[Knowledge] = "clock"
-
-    def __post_init__(self) -> None:
-        self._chance = Chance(_STREAM)
-        super().__post_init__()
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Restart the random streams; run i draws from the stream of ``seed + i``."""
-        self._chance.reset(runs, seed)
+    stream: ClassVar[int] = 0x72616E646F6D  # independent of the noise of the same seed
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         sensors, runs = shape_of(signals)
-        return self._chance.draw(sensors, runs) < self.column("rate", sensors)
+        return self.draw(sensors, runs) < self.column("rate", sensors)

@@ -15,13 +15,11 @@ from fusion_gym.policies.base import (
     parameter,
     surprise,
 )
-from fusion_gym.policies.chance import Chance
-
-_STREAM = 0x73746F6368  # makes draws independent of the noise of the same seed
+from fusion_gym.policies.chance import ChanceRule
 
 
 @dataclass
-class StochasticEvent(LocalRule):
+class StochasticEvent(ChanceRule, LocalRule):
     r"""Keep each sensor silent with probability exp(-w |z|² / 2), with z its innovation.
 
     The weight w is the paper's Z, here a multiple of the identity for each sensor. Given silence
@@ -58,17 +56,10 @@ class StochasticEvent(LocalRule):
     weight: PerSensor = parameter(1.0, not_negative_parameter)
     whitened: bool = parameter(False, validation.boolean)
     knowledge: ClassVar[Knowledge] = "own"
-
-    def __post_init__(self) -> None:
-        self._chance = Chance(_STREAM)
-        super().__post_init__()
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Restart the random streams; run i draws from the stream of ``seed + i``."""
-        self._chance.reset(runs, seed)
+    stream: ClassVar[int] = 0x73746F6368  # independent of the noise of the same seed
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         squared = surprise(signals, self.whitened)
         silence = np.exp(-0.5 * self.column("weight", len(squared)) * squared)
-        return self.limit(self._chance.draw(*squared.shape) >= silence, signals)
+        return self.limit(self.draw(*squared.shape) >= silence, signals)

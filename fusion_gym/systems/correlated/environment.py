@@ -27,6 +27,7 @@ from fusion_gym.systems.correlated.system import (
     CorrelatedTrackingPlant,
 )
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
+from fusion_gym.systems.parts import numbered_states
 
 _T = 0.01  # the paper's sampling time
 _STRUCTURE = Structure(common="all contain the same process noise", prediction=True)
@@ -111,16 +112,15 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     horizon = validation.horizon(options.horizon)
     plant, sensors = _plant_and_sensors(options)
     open_loop = plant.open_loop(horizon)
-    chosen = options.state_weights
-    if chosen is not None:
-        chosen = validation.not_negative("state_weights", chosen, open_loop.shape)
+    chosen = options.own_weights(plant.size)
     weights = equal_weights(open_loop) if chosen is None else chosen
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    plant.warn_of_unseen_growth(sensors.measurement_matrix, _state_names(plant.size))
+    names = numbered_states(plant.size, ("position", "velocity", "acceleration"))
+    plant.warn_of_unseen_growth(sensors.measurement_matrix, names)
     if options.track_actual:
         nature.refuse("with track_actual=True")
-    names, scale = _state_names(plant.size), _noise_scale(options.noise_scale)
+    scale = _noise_scale(options.noise_scale)
     truth = CorrelatedTrackingPlant(plant, sensors, scale, names, nature)
     estimator = CorrelatedTrackingEstimator(
         model=plant,
@@ -166,17 +166,9 @@ def _noise_scale(value: float | str) -> float | None:
 
 def _trigger(options: CorrelatedTrackingOptions, sensors: int) -> dict[str, tuple[float, ...]]:
     """Parameters of the adaptive innovation trigger, one number a sensor."""
-    return {
-        name: tuple(validation.not_negative(f"trigger_{name}", value, (sensors,)).tolist())
-        for name, value in (
-            ("threshold", options.trigger_threshold),
-            ("offset", options.trigger_offset),
-            ("sensitivity", options.trigger_sensitivity),
-        )
-    }
-
-
-def _state_names(size: int) -> tuple[str, ...]:
-    if size == 3:
-        return ("position", "velocity", "acceleration")
-    return tuple(f"x{i + 1}" for i in range(size))
+    result = {}
+    for name in ("threshold", "offset", "sensitivity"):
+        field = f"trigger_{name}"
+        values = validation.not_negative(field, getattr(options, field), (sensors,))
+        result[name] = tuple(values.tolist())
+    return result

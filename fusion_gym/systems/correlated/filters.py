@@ -87,10 +87,7 @@ class RobustKalmanFilter:
         cross = linalg.matmul(covariance, linalg.transpose(sensors.measurement_matrix))
         cross += sensors.cross_covariance
         innovation = self.innovation_covariance(covariance)
-        if sensors.size == 1:
-            gain = cross / innovation
-        else:
-            gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
+        gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
         rest = linalg.identity(covariance.shape[-2]) - linalg.matmul(
             gain, sensors.measurement_matrix
         )
@@ -113,17 +110,15 @@ class JointErrorCovariance:
     depend on the noise. It contains (23) and (28). With the fusion's weights it gives (43) and (55)
     together with the cross-covariances of the fused prediction in them.
 
-    Shapes: ``transition`` (n, n, 1), ``process_covariance`` (n, n, 1), ``initial_covariance``
-    (n, n, 1); ``measurement_matrix`` (l + 1, m, n, 1), ``cross_covariance`` (l + 1, n, m, 1) and
+    Shapes: ``measurement_matrix`` (l + 1, m, n, 1), ``cross_covariance`` (l + 1, n, m, 1) and
     ``covariance`` (l + 1, l + 1, m, m, 1) as in :class:`CorrelatedSensors`, with zeros for the
-    fused estimate, which measures nothing. All are bounds; actual values are proportional.
+    fused estimate, which measures nothing. They and the plant's covariances are bounds; actual
+    values are proportional.
 
     Source: adaptive_innovation, equations (16), (17), (23), (28), (43), (55).
     """
 
-    transition: Array
-    process_covariance: Array
-    initial_covariance: Array
+    plant: LinearPlant
     measurement_matrix: Array
     cross_covariance: Array
     covariance: Array
@@ -133,9 +128,7 @@ class JointErrorCovariance:
         """Return the recursion of a plant and its sensors."""
         ahead = [(1, 0), (0, 0), (0, 0), (0, 0)]
         return cls(
-            transition=plant.transition,
-            process_covariance=plant.process_covariance,
-            initial_covariance=plant.initial_covariance,
+            plant=plant,
             measurement_matrix=np.pad(sensors.measurement_matrix, ahead),
             cross_covariance=np.pad(sensors.cross_covariance, ahead),
             covariance=np.pad(sensors.covariance, [(1, 0), *ahead]),
@@ -143,14 +136,14 @@ class JointErrorCovariance:
 
     def start(self, runs: int) -> Array:
         """Return the joint covariance (l+1, l+1, n, n, N) of time 0: all estimates are equal."""
-        count, size = len(self.measurement_matrix), len(self.transition)
-        return np.broadcast_to(self.initial_covariance, (count, count, size, size, runs)).copy()
+        count, start = len(self.measurement_matrix), self.plant.initial_covariance
+        return np.broadcast_to(start, (count, count, *start.shape[:2], runs)).copy()
 
     def predict(self, joint: Array) -> Array:
         """Return Φ J Φᵀ + Q in every block."""
-        moved = linalg.matmul(self.transition, joint)
-        moved = linalg.matmul(moved, linalg.transpose(self.transition))
-        return moved + self.process_covariance
+        moved = linalg.matmul(self.plant.transition, joint)
+        moved = linalg.matmul(moved, linalg.transpose(self.plant.transition))
+        return moved + self.plant.process_covariance
 
     def update(self, joint: Array, gain: Array, granted: NDArray[np.bool_]) -> Array:
         """Return the joint covariance after granted (l, N) nodes update with gains (l, n, m, N)."""

@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import (
     Block,
     age_block,
@@ -25,7 +25,6 @@ from fusion_gym.core.knowledge import (
     sensed,
 )
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.plant import Plant
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
     JointErrorCovariance,
@@ -34,28 +33,21 @@ from fusion_gym.systems.correlated.filters import (
 )
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
+from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.validation import refusal
 
-_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
 
 
 @dataclass(slots=True)
-class CorrelatedTrackingTruth:
-    """The true state of N runs at one time; n states, l sensors, m channels.
+class CorrelatedTrackingTruth(Truth):
+    """The true state of N runs at one time, with ``scale`` (N,), actual variances over bounds."""
 
-    ``truth`` (n, N) · ``scale`` (N,), actual variances over their bounds · ``measurement``
-    (l, m, N) · ``departure`` (4, N) of the truth from the model, if any.
-    """
-
-    truth: Array
     scale: Array
-    measurement: Array
-    departure: Array | None = None
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
+class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
     """A linear plant with sensors that share its noise.
 
     ``dynamics.process_factor`` is Γ Q^½, so that plant and sensors use the same normals.
@@ -70,16 +62,6 @@ class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
     nature: Nature = AS_ASSUMED
 
     @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.sensors.count
-
-    @property
-    def noise_channels(self) -> int:
-        """Normals of one step: process noise, then the sensors'."""
-        return self.dynamics.noise_channels + self.sensors.noise_channels
-
-    @property
     def start_channels(self) -> int:
         """Normals of a start: the state's deviation, the noise scale, nature's."""
         return self.dynamics.initial_factor.shape[1] + 1 + self.nature.channels
@@ -90,7 +72,7 @@ class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
         scale = self._scale(noise[-1])
         truth = self.dynamics.start(self.dynamics.initial_mean, np.sqrt(scale) * noise[:-1])
         nothing = np.full((self.sensors.count, self.sensors.size, noise.shape[-1]), np.nan)
-        return CorrelatedTrackingTruth(truth, scale, nothing, departure), None
+        return CorrelatedTrackingTruth(truth, nothing, departure, scale), None
 
     def sense(self, state: CorrelatedTrackingTruth, noise: Array) -> CorrelatedTrackingTruth:
         """Move the plant, and measure with the same noise.
@@ -100,8 +82,7 @@ class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
         actual, r = np.sqrt(state.scale) * noise, self.dynamics.noise_channels
         process, own = true_noise(state.departure, actual[:r], actual[r:])
         truth = self.dynamics.advance(state.truth, process, state.departure)
-        measurement = self.sensors.measure(truth, process, own)
-        return CorrelatedTrackingTruth(truth, state.scale, measurement, state.departure)
+        return replace(state, truth=truth, measurement=self.sensors.measure(truth, process, own))
 
     @property
     def draw_channels(self) -> int:
@@ -114,7 +95,7 @@ class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
         """Draw the noise scale from its law, and the truth from that share of the covariance."""
         scale = self._scale(noise[-1])
         truth = linalg.draw_normal(mean, scale * covariance, noise[:-1])
-        return CorrelatedTrackingTruth(truth, scale, measurement)
+        return CorrelatedTrackingTruth(truth, measurement, None, scale)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the bound of the mean error variance (n,) of predictions over t = 1..horizon."""
@@ -135,20 +116,15 @@ class CorrelatedTrackingPlant(Plant[CorrelatedTrackingTruth]):
 
 
 @dataclass(slots=True)
-class CorrelatedTrackingEstimate:
+class CorrelatedTrackingEstimate(Deliveries):
     """The estimates of N runs at one time; n states, l sensors, m channels.
 
-    Estimate 0 is the fused one and estimate i is node i's. ``measurement`` (l, m, N) · ``held``
-    (l, m, N), the last delivered measurement · ``age`` (l, N), steps since then · ``prior_mean``
-    (l + 1, n, N), ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and
-    ``outcomes`` at the nodes · ``means`` (l + 1, n, N), ``covariances`` (l + 1, n, n, N),
-    posteriors · ``joint`` (l + 1, l + 1, n, n, N), the bound of the errors' covariances, if
-    tracked.
+    Estimate 0 is the fused one and estimate i is node i's. ``prior_mean`` (l + 1, n, N),
+    ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``outcomes`` at
+    the nodes · ``means`` (l + 1, n, N), ``covariances`` (l + 1, n, n, N), posteriors · ``joint``
+    (l + 1, l + 1, n, n, N), the bound of the errors' covariances, if tracked.
     """
 
-    measurement: Array
-    held: Array
-    age: Array
     prior_mean: Array
     prior_covariance: Array
     expected: Array
@@ -162,21 +138,16 @@ SIGNALS = common_signals(prior_covariance="conservative covariance of the predic
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingEstimator(Estimator[CorrelatedTrackingEstimate]):
+class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
     """Robust local filters, and a fusion rule without feedback.
 
-    ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
-    estimates and ``reference`` (n,) observed variances. ``joint`` tracks the covariances of the
-    errors, of which the actual ones are the share ``noise_scale`` in the mean.
+    ``joint`` tracks the covariances of the errors, of which the actual ones are the share
+    ``noise_scale`` in the mean.
     """
 
     model: LinearPlant
     filter: RobustKalmanFilter
     fusion: FusionRule
-    state_names: tuple[str, ...]
-    state_weights: Array
-    magnitude: Array
-    reference: Array
     noise_scale: float
     joint: JointErrorCovariance | None = None
     signals = SIGNALS
@@ -185,12 +156,10 @@ class CorrelatedTrackingEstimator(Estimator[CorrelatedTrackingEstimate]):
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes, states = numbered(self.filter.sensors.count), self.state_names
-        block = partial(Block, limit=_RANGE)
+        nodes = numbered(self.filter.sensors.count)
+        block = partial(Block, limit=RANGE)
         components = (nodes, numbered(self.filter.sensors.size))
         innovation = "innovation of the node over its predicted deviation"
-        deviation = "logarithm of the node's predicted over the open-loop deviation"
-        open_loop = {"open-loop deviation": np.sqrt(self.reference)}
         return (
             block("whitened_innovation", innovation, self._whitened, components, "own", "own"),
             block(
@@ -201,27 +170,19 @@ class CorrelatedTrackingEstimator(Estimator[CorrelatedTrackingEstimate]):
                 "scheduler",
             ),
             age_block(nodes),
-            block(
+            self.deviation_block(
                 "local_log_deviation",
-                deviation,
+                "logarithm of the node's predicted over the open-loop deviation",
                 lambda s: log_deviation(s.prior_covariance[1:], self.reference),
-                (nodes, states),
-                node="own",
-                constants=open_loop,
+                nodes,
             ),
-            block(
+            self.deviation_block(
                 "log_deviation",
                 "logarithm of the fused predicted over the open-loop deviation",
                 lambda s: log_deviation(s.prior_covariance[0], self.reference),
-                (states,),
-                constants=open_loop,
             ),
-            block(
-                "estimate",
-                "fused prediction over the state's root mean square",
-                lambda s: s.prior_mean[0] / self.magnitude[:, None],
-                (states,),
-                constants={"root mean square": self.magnitude},
+            self.estimate_block(
+                "fused prediction over the state's root mean square", lambda s: s.prior_mean[0]
             ),
         )
 
@@ -263,12 +224,6 @@ class CorrelatedTrackingEstimator(Estimator[CorrelatedTrackingEstimate]):
             joint=joint,
         )
 
-    def observe(
-        self, state: CorrelatedTrackingEstimate, measurement: Array
-    ) -> CorrelatedTrackingEstimate:
-        """Take the measurement."""
-        return replace(state, measurement=measurement)
-
     def update(
         self, state: CorrelatedTrackingEstimate, reception: Reception
     ) -> CorrelatedTrackingEstimate:
@@ -301,17 +256,13 @@ class CorrelatedTrackingEstimator(Estimator[CorrelatedTrackingEstimate]):
         """Return the signals of ``SIGNALS``."""
         outcomes = sensed(state.outcomes)
         return {
-            "measurement": state.measurement,
+            **super().read(state, failure),
             "innovation": lambda: state.measurement - state.expected,
-            "held": state.held,
-            "age": state.age,
             "expected_measurement": state.expected,
             "innovation_deviation": lambda: _deviation(outcomes.innovation_covariance),
             "prior_mean": state.prior_mean[0],
             "prior_covariance": state.prior_covariance[0],
-            "silent_variance": lambda: linalg.weighted_trace(
-                state.prior_covariance[0], self.state_weights
-            ),
+            "silent_variance": lambda: self.trace(state.prior_covariance[0]),
             "variance_reduction": lambda: self._variance_reduction(state, outcomes),
         }
 
@@ -376,13 +327,13 @@ class CorrelatedTrackingEstimator(Estimator[CorrelatedTrackingEstimate]):
         self, state: CorrelatedTrackingEstimate, outcomes: RobustOutcomes
     ) -> Array:
         covariance = np.concatenate((state.prior_covariance[:1], outcomes.delivered_covariance))
-        silent = linalg.weighted_trace(covariance[0], self.state_weights)
+        silent = self.trace(covariance[0])
         result = np.empty((self.filter.sensors.count, len(silent)))
         for sensor in range(self.filter.sensors.count):
             single = np.zeros(result.shape, dtype=np.bool_)
             single[sensor] = True
             fused = self.fusion.fuse(state.prior_mean, covariance, _with_prediction(single))
-            result[sensor] = silent - linalg.weighted_trace(fused.covariance, self.state_weights)
+            result[sensor] = silent - self.trace(fused.covariance)
         return result
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import (
     Block,
     age_block,
@@ -32,24 +32,19 @@ from fusion_gym.systems.markov_jump.centralised_linear import (
 from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.system import OF_FAMILY, sampling_blocks
-
-_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
+from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator
 
 
 @dataclass(slots=True)
-class MarkovJumpCentralEstimate:
+class MarkovJumpCentralEstimate(Deliveries):
     """The centre's estimate of N runs at one time k; n states, l sensors.
 
-    ``time`` k (N,) · ``measurement`` (l, 1, N), the held value where a sensor does not sample ·
-    ``held`` (l, 1, N), the last delivered measurement · ``age`` (l, N), steps since then ·
+    ``measurement`` (l, 1, N), the held value where a sensor does not sample · ``time`` k (N,) ·
     ``belief``, a prior until delivery · ``prediction`` from that prior · ``mean`` (n, N),
     ``covariance`` (n, n, N), after the delivery.
     """
 
     time: Times
-    measurement: Array
-    held: Array
-    age: Array
     belief: Belief
     prediction: ModePrediction | None
     mean: Array
@@ -68,40 +63,19 @@ CENTRAL_SIGNALS = (
 
 
 @dataclass(frozen=True)
-class MarkovJumpCentralEstimator(Estimator[MarkovJumpCentralEstimate]):
+class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
     """One filter at the centre.
 
     A packet carries the sensor's new measurement. A request of a sensor that does not sample
     delivers nothing, although the network grants it and takes its tokens. Nothing is fed back.
 
-    ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
-    estimates, ``reference`` (n,) observed variances and ``scale`` (l,) observed measurements.
+    ``scale`` (l,) divides observed measurements.
     """
 
     model: AugmentedModel
     filter: CentralisedLinearFilter | InteractingModels
-    state_names: tuple[str, ...]
-    state_weights: Array
-    magnitude: Array
-    reference: Array
     scale: Array
     signals = CENTRAL_SIGNALS
-
-    @classmethod
-    def create(
-        cls,
-        model: AugmentedModel,
-        interacting: bool,
-        state_names: tuple[str, ...],
-        state_weights: Array,
-        horizon: int,
-    ) -> MarkovJumpCentralEstimator:
-        """Return the estimator with :class:`InteractingModels` or the linear filter."""
-        linear = CentralisedLinearFilter.create(model, horizon)
-        chosen = InteractingModels.create(model.plant, model.sensors) if interacting else linear
-        reference, magnitude = model.scales(horizon)
-        scale = _measured(linear, horizon)
-        return cls(model, chosen, state_names, state_weights, magnitude, reference, scale)
 
     @property
     def covariance_cycle(self) -> int | None:  # type: ignore[override]
@@ -113,16 +87,9 @@ class MarkovJumpCentralEstimator(Estimator[MarkovJumpCentralEstimate]):
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation; mode probabilities only with interacting models."""
-        nodes, n, scale = (
-            numbered(self.model.sensors.count),
-            self.model.plant.size,
-            self.scale[:, None],
-        )
-        block = partial(Block, limit=_RANGE)
+        nodes, n = numbered(self.model.sensors.count), self.model.plant.size
+        scale, block = self.scale[:, None], partial(Block, limit=RANGE)
         innovation = "innovation against the centre's expectation, whitened, 0 without a sample"
-        deviation = (
-            "logarithm of the innovation's deviation over the measurement's root mean square"
-        )
         measured = {"root mean square": self.scale}
         probability = Block(
             "mode_probability",
@@ -145,24 +112,19 @@ class MarkovJumpCentralEstimator(Estimator[MarkovJumpCentralEstimate]):
             age_block(nodes),
             block(
                 "innovation_log_deviation",
-                deviation,
+                "logarithm of the innovation's deviation over the measurement's root mean square",
                 lambda s: np.log(self._deviation(sensed(s.prediction)) / scale),
                 (nodes,),
                 constants=measured,
             ),
-            block(
+            self.deviation_block(
                 "log_deviation",
                 "logarithm of the predicted over the open-loop deviation",
-                self._log_deviation,
-                (self.state_names,),
-                constants={"open-loop deviation": np.sqrt(self.reference)},
+                lambda s: log_deviation(sensed(s.prediction).covariance[:n, :n], self.reference),
             ),
-            block(
-                "estimate",
+            self.estimate_block(
                 "prediction over the state's root mean square",
-                lambda s: sensed(s.prediction).mean[:n] / self.magnitude[:, None],
-                (self.state_names,),
-                constants={"root mean square": self.magnitude},
+                lambda s: sensed(s.prediction).mean[:n],
             ),
             *((probability,) if isinstance(self.filter, InteractingModels) else ()),
         )
@@ -174,7 +136,7 @@ class MarkovJumpCentralEstimator(Estimator[MarkovJumpCentralEstimate]):
         mean, covariance = self.filter.estimate(belief)
         held = self.filter.prediction(belief, time).mean[n:, None]
         age = np.zeros((count, runs))
-        return MarkovJumpCentralEstimate(time, held, held, age, belief, None, mean, covariance)
+        return MarkovJumpCentralEstimate(held, held, age, time, belief, None, mean, covariance)
 
     def predict(self, state: MarkovJumpCentralEstimate) -> MarkovJumpCentralEstimate:
         """Predict states and measurements."""
@@ -219,15 +181,13 @@ class MarkovJumpCentralEstimator(Estimator[MarkovJumpCentralEstimate]):
         prediction, n = sensed(state.prediction), self.model.plant.size
         prior = prediction.covariance[:n, :n]
         return {
-            "measurement": state.measurement,
+            **super().read(state, failure),
             "innovation": lambda: self._innovation(state, prediction)[:, None],
-            "held": state.held,
-            "age": state.age,
             "expected_measurement": prediction.mean[n:, None],
             "innovation_deviation": lambda: self._deviation(prediction)[:, None],
             "prior_mean": prediction.mean[:n],
             "prior_covariance": prior,
-            "silent_variance": lambda: linalg.weighted_trace(prior, self.state_weights),
+            "silent_variance": lambda: self.trace(prior),
             "variance_reduction": lambda: self._reduction(
                 prediction.covariance, self.state_weights, self.model.sensors.sampled(state.time)
             ),
@@ -236,17 +196,9 @@ class MarkovJumpCentralEstimator(Estimator[MarkovJumpCentralEstimate]):
             "sampled": lambda: self.model.sensors.sampled(state.time),
         }
 
-    def local_means(self, state: MarkovJumpCentralEstimate) -> Array:
-        """Return the centre's estimate for each sensor (sensors, n, N); nodes have no filters."""
-        return np.repeat(state.mean[None], self.model.sensors.count, axis=0)
-
     def _whitened(self, state: MarkovJumpCentralEstimate) -> Array:
         prediction = sensed(state.prediction)
         return self._innovation(state, prediction) / self._deviation(prediction)
-
-    def _log_deviation(self, state: MarkovJumpCentralEstimate) -> Array:
-        n = self.model.plant.size
-        return log_deviation(sensed(state.prediction).covariance[:n, :n], self.reference)
 
     def _innovation(self, state: MarkovJumpCentralEstimate, prediction: ModePrediction) -> Array:
         surprise = state.measurement[:, 0] - prediction.mean[self.model.plant.size :]
@@ -282,16 +234,3 @@ class MarkovJumpCentralEstimator(Estimator[MarkovJumpCentralEstimate]):
             covariance = covariance - linalg.outer(column, column) * weight
             left = left & ~selected
         return result
-
-
-def _measured(linear: CentralisedLinearFilter, horizon: int) -> Array:
-    """Return root mean squares (l,) of the sensors' measurements over k = 1..horizon."""
-    model = linear.model
-    sensors, noise = model.sensors, model.plant.noise_covariance
-    total = np.zeros(sensors.count)
-    coupling = sensors.noise_coupling[..., 0]
-    for time, step in zip(range(horizon + 1), model.steps(), strict=False):
-        if time > 0:
-            total += ((model.faded @ step.moment) * model.faded).sum(1)
-            total += linear.variance[:, min(time, linear.variance.shape[1] - 1)]
-    return np.asarray(np.sqrt(total / horizon + ((coupling @ noise) * coupling).sum(1)))

@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    LONGEST,
     ROUNDING,
     AugmentedModel,
     Times,
     settled,
 )
-
-_LONGEST = 2000  # steps after which tables that have not settled end anyway
 
 
 class Belief(NamedTuple):
@@ -177,14 +176,23 @@ class CentralisedLinearFilter:
             own = sensors.fading_variance * observed + sensors.variance[:, 0]
             rows.append((np.hstack((model.transition, step.input)), step.additional, own))
             before, now = now, step.moments(model.plant)
-            if time > 0 and settled(now, before):
-                break
-            if time >= max(horizon + 2, _LONGEST):
+            if (time > 0 and settled(now, before)) or time >= max(horizon + 2, LONGEST):
                 break
         motion, additional, variance = (
             np.stack(entries, -1) for entries in zip(*rows, strict=True)
         )
         return cls(model, maps[None, ..., None], motion, additional, variance)
+
+    def measured(self, horizon: int) -> Array:
+        """Return root mean squares (l,) of the sensors' measurements over k = 1..horizon."""
+        model, coupling = self.model, self.model.sensors.noise_coupling[..., 0]
+        total = np.zeros(len(coupling))
+        for time, step in zip(range(horizon + 1), model.steps(), strict=False):
+            if time > 0:
+                total += ((model.faded @ step.moment) * model.faded).sum(1)
+                total += self.variance[:, min(time, self.variance.shape[1] - 1)]
+        shared = ((coupling @ model.plant.noise_covariance) * coupling).sum(1)
+        return np.asarray(np.sqrt(total / horizon + shared))
 
     def start(self, runs: int) -> Belief:
         """Return the belief of time 0, without measurements."""

@@ -23,10 +23,12 @@ from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralEstim
 from fusion_gym.systems.markov_jump.centralised_linear import CentralisedLinearFilter
 from fusion_gym.systems.markov_jump.fading_plant import FadingPlant
 from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
+from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.system import MarkovJumpEstimator
+from fusion_gym.systems.parts import numbered_states
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
@@ -137,13 +139,12 @@ def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
         options.measurement_variance,
         dynamics,
     )
-    weights = options.state_weights
-    if weights is not None:
-        weights = validation.not_negative("state_weights", weights, (dynamics.size,))
+    weights = options.own_weights(dynamics.size)
     nature = Nature.create(options, (*dynamics.unmoved, "true_threshold_shift"))
     nature.check_growth(dynamics.true_radius, horizon)
     model = AugmentedModel.create(dynamics, sensors)
-    plant = FadingPlant(dynamics, sensors, model, _state_names(dynamics.size), nature)
+    names = numbered_states(dynamics.size, ("position", "velocity"))
+    plant = FadingPlant(dynamics, sensors, model, names, nature)
     estimator = _estimator(options.filter, options.fusion, plant, weights, horizon)
     memory = None
     if (kind := options.memory_filter) is not None:
@@ -169,12 +170,18 @@ def _estimator(
     where: str, kind: str | None, plant: FadingPlant, weights: Array | None, horizon: int
 ) -> MarkovJumpEstimator | MarkovJumpCentralEstimator:
     """Return the estimator of a filter and a fusion rule."""
-    model, names = plant.model, plant.state_names
+    model = plant.model
     fusion = _fusion(kind, where, plant.sensor_count, weights)
-    weights = equal_weights(model.open_loop(horizon)) if weights is None else weights
-    if fusion is None:
-        return MarkovJumpCentralEstimator.create(model, where == "imm", names, weights, horizon)
-    return MarkovJumpEstimator.create(model, fusion, names, weights, horizon)
+    reference, magnitude = model.scales(horizon)
+    weights = equal_weights(reference) if weights is None else weights
+    scales = plant.state_names, weights, magnitude, reference
+    if fusion is not None:
+        filters = LocalFilters.create(model, horizon)
+        recursion = LagRecursion.create(filters, model.plant.size)
+        return MarkovJumpEstimator(*scales, model, filters, recursion, fusion)
+    linear = CentralisedLinearFilter.create(model, horizon)
+    chosen = InteractingModels.create(model.plant, model.sensors) if where == "imm" else linear
+    return MarkovJumpCentralEstimator(*scales, model, chosen, linear.measured(horizon))
 
 
 def _fusion(kind: str | None, where: str, sensors: int, weights: Array | None) -> FusionRule | None:
@@ -188,9 +195,3 @@ def _fusion(kind: str | None, where: str, sensors: int, weights: Array | None) -
         return None
     kind = "matrix" if kind is None else kind
     return choose_rule(kind, _STRUCTURE, sensors, state_weights=weights)
-
-
-def _state_names(size: int) -> tuple[str, ...]:
-    if size == 2:
-        return ("position", "velocity")
-    return tuple(f"x{i + 1}" for i in range(size))

@@ -13,31 +13,26 @@ import numpy as np
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.plant import Plant
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw_mode
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
+from fusion_gym.systems.parts import SensorPlant, Truth
 
 
 @dataclass(slots=True)
-class MarkovJumpTruth:
-    """The true state of N runs at one time k; n states, r noises, l sensors.
+class MarkovJumpTruth(Truth):
+    """The true state of N runs at one time k, measured as if all sensors sampled.
 
-    ``time`` k (N,) · ``truth`` (n, N), ``mode`` θ (N,), ``process_noise`` w(k) (r, N), which moves
-    the plant next · ``measurement`` (l, 1, N), as if all sensors sampled · ``departure`` (4, N) of
-    the truth from the model, if any.
+    ``time`` k (N,) · ``mode`` θ (N,) · ``process_noise`` w(k) (r, N), which moves the plant next.
     """
 
     time: Times
-    truth: Array
     mode: Modes
     process_noise: Array
-    measurement: Array
-    departure: Array | None = None
 
 
 @dataclass(frozen=True)
-class FadingPlant(Plant[MarkovJumpTruth]):
+class FadingPlant(SensorPlant[MarkovJumpTruth]):
     """A Markov jump plant with fading sensors, and the augmented model of its moments.
 
     ``nature`` is the departure of the truth from this model.
@@ -50,14 +45,9 @@ class FadingPlant(Plant[MarkovJumpTruth]):
     nature: Nature = AS_ASSUMED
 
     @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.sensors.count
-
-    @property
     def noise_channels(self) -> int:
         """Normals of one step: process noise, mode, sensors."""
-        return self.dynamics.noise_channels + 1 + self.sensors.noise_channels
+        return super().noise_channels + 1
 
     @property
     def start_channels(self) -> int:
@@ -70,9 +60,9 @@ class FadingPlant(Plant[MarkovJumpTruth]):
         first, runs = self.dynamics.size + 1, noise.shape[-1]
         truth, mode = self.dynamics.start(noise[:first])
         process = true_noise(departure, noise[first:], noise[:0])[0]
-        process_noise = self.dynamics.process_noise(process)
+        drawn = self.dynamics.process_noise(process)
         time, nothing = np.zeros(runs, np.int64), np.full((self.sensors.count, 1, runs), np.nan)
-        return MarkovJumpTruth(time, truth, mode, process_noise, nothing, departure), None
+        return MarkovJumpTruth(truth, nothing, departure, time, mode, drawn), None
 
     def sense(self, state: MarkovJumpTruth, noise: Array) -> MarkovJumpTruth:
         """Move the plant, and measure with all sensors.
@@ -89,7 +79,7 @@ class FadingPlant(Plant[MarkovJumpTruth]):
         drawn = plant.process_noise(process)
         measurement = sensors.measure(following, jumped, drawn, np.concatenate((fading, own)))
         return MarkovJumpTruth(
-            state.time + 1, following, jumped, drawn, measurement[:, None], state.departure
+            following, measurement[:, None], state.departure, state.time + 1, jumped, drawn
         )
 
     @property
@@ -112,7 +102,7 @@ class FadingPlant(Plant[MarkovJumpTruth]):
         truth = linalg.draw_normal(mean, covariance, noise[:n])
         mode = draw_mode(np.cumsum(law, 0)[:-1], noise[n])
         process_noise = plant.process_noise(noise[n + 1 :])
-        return MarkovJumpTruth(times, truth, mode, process_noise, measurement)
+        return MarkovJumpTruth(truth, measurement, None, times, mode, process_noise)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""

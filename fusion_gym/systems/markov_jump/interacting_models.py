@@ -103,7 +103,6 @@ class InteractingModels:
 
     def predict(self, belief: Belief, time: Times) -> Belief:
         """Return the prediction for ``time`` + 1 from the belief after ``time`` (N,)."""
-        del time  # the models do not depend on it
         modes, chain = range(self.plant.modes), self.plant.mode_transition
         moved = linalg.matvec(self.motion, belief.mean)
         spread = linalg.congruence(self.motion, belief.covariance)
@@ -125,14 +124,12 @@ class InteractingModels:
 
     def prediction(self, belief: Belief, time: Times) -> ModePrediction:
         """Return the prediction of plant and measurements for ``time`` (N,)."""
-        del time
         return predict_jointly(belief, self.maps, self._variance(belief))
 
     def update(
         self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
     ) -> Belief:
         """Return the belief after the ``taken`` (l, N) of the measurements (l, N)."""
-        del time
         rows, variance = self.maps[:, self.plant.size :], self._variance(belief)
         after, likelihood = condition_on(belief, rows, variance, measurement, taken)
         # The likeliest possible model has weight one, so that far tails do not make 0 / 0.

@@ -183,7 +183,4 @@ def _pairs(count: int) -> list[tuple[int, int]]:
 
 def _collapse(rows: Array, states: int) -> Array:
     """Return the sum of the modes' parts of the first axis: (modes · n, ...) to (n, ...)."""
-    result = rows[:states].copy()
-    for first in range(states, len(rows), states):
-        result += rows[first : first + states]
-    return result
+    return linalg.total(rows.reshape(-1, states, *rows.shape[1:]), 0)

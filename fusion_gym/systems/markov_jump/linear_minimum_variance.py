@@ -23,7 +23,7 @@ from fusion_gym.systems.markov_jump.sensors import FadingSensors
 
 Times = NDArray[np.int64]
 
-_LONGEST = 2000  # steps after which tables that have not become periodic end anyway
+LONGEST = 2000  # steps after which tables that have not become periodic end anyway
 _SETTLED = 1e-13  # change over a period, in deviations of each state, below which they have
 _CANCELLED = 1e-6  # of two squares, what is left has lost six digits
 ROUNDING = 1e-14  # relative, of a sum over modes
@@ -252,9 +252,8 @@ class LocalFilters:
             row, following = _advance(model, step, joint, shared, noise, time)
             rows.append(row)
             observed.append((*step.moments(plant), joint.swapaxes(1, 2)))
-            if time > period and settled(observed[time], observed[time - period]):
-                break
-            if time >= max(horizon + 2, _LONGEST):
+            periodic = time > period and settled(observed[time], observed[time - period])
+            if periodic or time >= max(horizon + 2, LONGEST):
                 break
             joint = following
         tables = {

@@ -16,7 +16,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
 from fusion_gym.errors import forbidden
-from fusion_gym.systems.linear_plant import covariance_factor
+from fusion_gym.systems.linear_plant import covariance_factor, initial_law
 from fusion_gym.validation import ConfigurationError
 
 Modes = NDArray[np.int64]
@@ -111,7 +111,6 @@ class MarkovJumpPlant:
         if isinstance(process_covariance, (int, float, np.number)):
             values = validation.number("process_covariance", process_covariance) * np.eye(noises)
         noise = validation.covariance("process_covariance", values, noises)
-        start = validation.covariance("initial_covariance", initial_covariance, size)
         plant = cls(
             transition=np.ascontiguousarray(matrices.transpose(1, 2, 0)),
             process_gain=np.ascontiguousarray(gains.transpose(1, 2, 0)),
@@ -121,9 +120,7 @@ class MarkovJumpPlant:
             initial_probabilities=probabilities(
                 "initial_probabilities", initial_probabilities, (modes,)
             ),
-            initial_mean=validation.array("initial_mean", initial_mean, (size,))[..., None],
-            initial_covariance=start[..., None],
-            initial_factor=linalg.root(start[..., None]),
+            **initial_law(initial_mean, initial_covariance, size),
         )
         radius = plant.second_moment_radius()
         if radius >= 1.0 - 1e-9:

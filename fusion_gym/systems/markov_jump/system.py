@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import (
     Block,
     Signal,
@@ -25,45 +25,36 @@ from fusion_gym.core.knowledge import (
     sensed,
 )
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
-from fusion_gym.systems.markov_jump.lag_errors import (
-    JointPrediction,
-    LagCovariances,
-    LagRecursion,
-)
+from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
     LocalFilters,
     Times,
 )
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
+from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator
 
-_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero right after a packet
 
 
 @dataclass(slots=True)
-class MarkovJumpEstimate:
+class MarkovJumpEstimate(Deliveries):
     """The estimates of N runs at one time k; n states, a = modes · n, r noises, l sensors.
 
-    ``time`` k (N,) · ``measurement`` (l, 1, N), NaN, and ``innovation`` ε (l, N), zero, where a
-    sensor does not sample · ``node_mean`` ζ̂(k|k) (l, a, N), ``node_noise`` ŵ (l, r, N), the nodes'
-    · ``copy_mean`` (l, a, N), ``copy_noise`` (l, r, N), the centre's: a prediction until delivery ·
-    ``held`` (l, n, N), the last delivered estimates · ``age`` (l, N), steps since then · ``sent``
-    (l, N) bool, the last deliveries · ``lags`` and ``prediction``, covariances · ``prior_mean``
-    (n, N), ``prior_covariance`` (n, n, N), fused without a transmission · ``mean`` (n, N),
-    ``covariance`` (n, n, N), fused after the delivery.
+    ``measurement`` (l, 1, N), NaN, and ``innovation`` ε (l, N), zero, where a sensor does not
+    sample · ``held`` (l, n, N), the last delivered estimates · ``time`` k (N,) · ``node_mean``
+    ζ̂(k|k) (l, a, N), ``node_noise`` ŵ (l, r, N), the nodes' · ``copy_mean`` (l, a, N),
+    ``copy_noise`` (l, r, N), the centre's: a prediction until delivery · ``lags`` and
+    ``prediction``, covariances · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), fused
+    without a transmission · ``mean`` (n, N), ``covariance`` (n, n, N), fused after the delivery.
     """
 
     time: Times
-    measurement: Array
     innovation: Array
     node_mean: Array
     node_noise: Array
     copy_mean: Array
     copy_noise: Array
-    held: Array
-    age: Array
-    sent: NDArray[np.bool_]
     lags: LagCovariances
     prediction: JointPrediction | None
     prior_mean: Array
@@ -110,39 +101,14 @@ def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
 
 
 @dataclass(frozen=True)
-class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
-    """The nodes' filters, the joint recursion of the errors and a fusion rule.
-
-    ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
-    estimates and ``reference`` (n,) observed variances.
-    """
+class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
+    """The nodes' filters, the joint recursion of the errors and a fusion rule."""
 
     model: AugmentedModel
     filters: LocalFilters
     recursion: LagRecursion
     fusion: FusionRule
-    state_names: tuple[str, ...]
-    state_weights: Array
-    magnitude: Array
-    reference: Array
     signals = SIGNALS
-
-    @classmethod
-    def create(
-        cls,
-        model: AugmentedModel,
-        fusion: FusionRule,
-        state_names: tuple[str, ...],
-        state_weights: Array,
-        horizon: int,
-    ) -> MarkovJumpEstimator:
-        """Return the estimator with tables for ``horizon`` steps."""
-        filters = LocalFilters.create(model, horizon)
-        recursion = LagRecursion.create(filters, model.plant.size)
-        reference, magnitude = model.scales(horizon)
-        return cls(
-            model, filters, recursion, fusion, state_names, state_weights, magnitude, reference
-        )
 
     @property
     def covariance_cycle(self) -> int:  # type: ignore[override]
@@ -152,44 +118,37 @@ class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes, states = (numbered(self.model.sensors.count),), (self.state_names,)
-        own = partial(Block, node="own", limit=_RANGE)
-        fused = partial(Block, labels=states, limit=_RANGE)
+        nodes = numbered(self.model.sensors.count)
+        own, every = partial(Block, node="own", limit=RANGE), (nodes, self.state_names)
         difference = "node's estimate minus the centre's copy, over its deviation"
         innovation = "node's innovation over its deviation, 0 without a sample"
         local = "logarithm of the root of the node's trace over the open-loop trace"
-        copies = "logarithm of the copy's predicted over the open-loop deviation"
-        open_loop = {"open-loop deviation": np.sqrt(self.reference)}
         return (
-            own("whitened_difference", difference, self._difference, nodes + states, "own"),
-            own("whitened_innovation", innovation, self._whitened_innovation, nodes, "own"),
+            own("whitened_difference", difference, self._difference, every, "own"),
+            own("whitened_innovation", innovation, self._whitened_innovation, (nodes,), "own"),
             *sampling_blocks(self.model.sensors),
-            age_block(*nodes),
+            age_block(nodes),
             own(
                 "local_log_deviation",
                 local,
                 self._local_log_deviation,
-                nodes,
+                (nodes,),
                 constants={"open-loop trace": self.reference.sum()},
             ),
-            own(
+            self.deviation_block(
                 "copy_log_deviation",
-                copies,
+                "logarithm of the copy's predicted over the open-loop deviation",
                 self._copy_log_deviation,
-                nodes + states,
-                constants=open_loop,
+                nodes,
             ),
-            fused(
+            self.deviation_block(
                 "log_deviation",
                 "logarithm of the silent fused over the open-loop deviation",
                 lambda s: log_deviation(s.prior_covariance, self.reference),
-                constants=open_loop,
             ),
-            fused(
-                "estimate",
+            self.estimate_block(
                 "fused estimate without a transmission over the root mean square",
-                lambda s: s.prior_mean / self.magnitude[:, None],
-                constants={"root mean square": self.magnitude},
+                lambda s: s.prior_mean,
             ),
         )
 
@@ -211,7 +170,6 @@ class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
             copy_noise=noise_mean,
             held=self._collapse(mean),
             age=np.zeros((count, runs)),
-            sent=np.ones((count, runs), dtype=np.bool_),
             lags=self.recursion.start(runs),
             prediction=None,
             prior_mean=state_mean,
@@ -228,9 +186,9 @@ class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
         time = state.time + 1
         before, place = self.filters.at(state.time), self.filters.at(time)
         copy_mean = self.filters.predict(state.copy_mean, state.copy_noise, before)
-        lags = self.recursion.predict(state.lags, state.sent, before)
+        lags = self.recursion.predict(state.lags, state.age == 0.0, before)
         prediction = self.recursion.prediction(lags, place)
-        silence = np.zeros(state.sent.shape, dtype=np.bool_)
+        silence = np.zeros(state.age.shape, dtype=np.bool_)
         silent = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(silence))
         return replace(
             state,
@@ -277,7 +235,6 @@ class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
             copy_noise=np.where(grant, state.node_noise, state.copy_noise),
             held=np.where(grant, self._collapse(state.node_mean), state.held),
             age=np.where(arrived, 0.0, state.age),
-            sent=arrived.copy(),
             mean=fused.mean,
             covariance=fused.covariance,
         )
@@ -287,17 +244,12 @@ class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
         prediction = sensed(state.prediction)
         place = self.filters.at(state.time)
         return {
+            **super().read(state, failure),
             "measurement": lambda: self._collapse(state.node_mean),
             "innovation": lambda: self._collapse(state.node_mean - state.copy_mean),
-            "held": state.held,
-            "age": state.age,
             "expected_measurement": lambda: self._collapse(state.copy_mean),
             "innovation_deviation": lambda: self._lag_deviation(prediction),
-            "prior_mean": state.prior_mean,
-            "prior_covariance": state.prior_covariance,
-            "silent_variance": lambda: linalg.weighted_trace(
-                state.prior_covariance, self.state_weights
-            ),
+            "silent_variance": lambda: self.trace(state.prior_covariance),
             "variance_reduction": lambda: self._variance_reduction(state, prediction),
             "centre_variance": lambda: linalg.trace(state.prior_covariance),
             "greedy_variance": lambda: self._greedy_variance(state, prediction),
@@ -323,11 +275,8 @@ class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
 
         Source: markov_jump, equation (44).
         """
-        n = self.model.plant.size
-        result = mean[:, :n].copy()
-        for first in range(n, mean.shape[1], n):
-            result += mean[:, first : first + n]
-        return result
+        nodes, _, runs = mean.shape
+        return linalg.total(mean.reshape(nodes, -1, self.model.plant.size, runs), 1)
 
     def _difference(self, state: MarkovJumpEstimate) -> Array:
         lag = self._collapse(state.node_mean - state.copy_mean)
@@ -354,16 +303,13 @@ class MarkovJumpEstimator(Estimator[MarkovJumpEstimate]):
         return np.sqrt(np.maximum(variance, (_FLOOR * _FLOOR) * self.reference[:, None]))
 
     def _variance_reduction(self, state: MarkovJumpEstimate, prediction: JointPrediction) -> Array:
-        silent = linalg.weighted_trace(state.prior_covariance, self.state_weights)
-        silence = np.zeros(state.sent.shape, dtype=np.bool_)
+        silent, silence = self.trace(state.prior_covariance), np.zeros(state.age.shape, np.bool_)
         each = self._covariances_after_next(state, prediction, silence)
-        return np.stack(
-            [silent - linalg.weighted_trace(covariance, self.state_weights) for covariance in each]
-        )
+        return np.stack([silent - self.trace(covariance) for covariance in each])
 
     def _greedy_variance(self, state: MarkovJumpEstimate, prediction: JointPrediction) -> Array:
         """Return the trace as sensors join in the order of the largest reduction."""
-        sent = np.zeros(state.sent.shape, dtype=np.bool_)
+        sent = np.zeros(state.age.shape, dtype=np.bool_)
         sensors, result = np.arange(self.model.sensors.count)[:, None], np.empty(sent.shape)
         trace = linalg.trace(state.prior_covariance)
         for _ in range(self.model.sensors.count):

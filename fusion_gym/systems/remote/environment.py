@@ -21,6 +21,7 @@ from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
 from fusion_gym.errors import forbidden
+from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
 from fusion_gym.systems.silence import Silence, Trigger
 
@@ -106,15 +107,12 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
     """Return the scenario of these options."""
     most = validation.MOST_SENSORS
     sensors = validation.integer("sensors", options.sensors, at_least=1, at_most=most)
-    weights = (
-        np.ones(sensors)
-        if options.state_weights is None
-        else validation.not_negative("state_weights", options.state_weights, (sensors,))
-    )
+    chosen = options.own_weights(sensors)
+    weights = np.ones(sensors) if chosen is None else chosen
     deviation = validation.positive("noise_deviation", options.noise_deviation, (sensors,))
     coefficient = validation.spread("coefficient", options.coefficient, (sensors,))
     sources = ScalarSources(
-        state_names=tuple(f"x{i + 1}" for i in range(len(coefficient))),
+        state_names=numbered_states(sensors),
         coefficient=coefficient,
         deviation=deviation,
         initial_deviation=validation.not_negative(

@@ -12,18 +12,13 @@ import numpy as np
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    Block,
-    age_block,
-    common_signals,
-    numbered,
-)
+from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.core.plant import Plant
 from fusion_gym.namespace import namespace
+from fusion_gym.systems.parts import RANGE, Deliveries
 from fusion_gym.systems.silence import Silence
 
-_RANGE = 5.0  # scaled errors are clipped here
 _FLOOR = 1e-12  # variance after a delivery, in process variances: zero could not be inverted
 
 
@@ -111,21 +106,17 @@ class ScalarSources(Plant[SourceTruth]):
 
 
 @dataclass(slots=True)
-class RemoteEstimate:
+class RemoteEstimate(Deliveries):
     """The estimate of N runs at one time; n sources, one sensor each.
 
-    ``measurement`` (n, 1, N) · ``prior`` a x̂(t-1) and ``mean`` x̂ (n, N), after the delivery ·
-    ``prior_variance`` and ``variance`` (n, N), of the errors by age · ``held`` (n, N), the last
-    delivered value · ``age`` (n, N), steps since then.
+    ``held`` (n, N), the last delivered value · ``prior`` a x̂(t-1) and ``mean`` x̂ (n, N), after the
+    delivery · ``prior_variance`` and ``variance`` (n, N), of the errors by age.
     """
 
-    measurement: Array
     prior: Array
     mean: Array
     prior_variance: Array
     variance: Array
-    held: Array
-    age: Array
 
 
 SIGNALS = common_signals(
@@ -188,7 +179,7 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
             (nodes,),
             "own",
             "own",
-            _RANGE,
+            RANGE,
             {"error_scale": self.error_scale},
         )
         return error, age_block(nodes)
@@ -197,9 +188,7 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
         """Return the centre's estimate 0."""
         nothing = np.zeros((len(measurement), measurement.shape[-1]))
         variance = np.repeat(self.model.initial_deviation[:, None] ** 2, nothing.shape[-1], axis=1)
-        return RemoteEstimate(
-            measurement, nothing, nothing, variance, variance, held=nothing, age=nothing
-        )
+        return RemoteEstimate(measurement, nothing, nothing, nothing, nothing, variance, variance)
 
     def predict(self, state: RemoteEstimate) -> RemoteEstimate:
         """Predict the sources."""
@@ -210,10 +199,6 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
             prior_variance=a * a * state.variance + sigma * sigma,
             age=state.age + 1.0,
         )
-
-    def observe(self, state: RemoteEstimate, measurement: Array) -> RemoteEstimate:
-        """Take the values."""
-        return replace(state, measurement=measurement)
 
     def update(self, state: RemoteEstimate, reception: Reception) -> RemoteEstimate:
         """Replace the centre's prediction where a packet arrives."""
@@ -247,10 +232,9 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
         """Return the signals of ``SIGNALS``."""
         weights = self.state_weights[:, None]
         return {
-            "measurement": state.measurement,
+            **super().read(state, failure),
             "innovation": lambda: state.measurement - state.prior[:, None],
             "held": state.held[:, None],
-            "age": state.age,
             "expected_measurement": state.prior[:, None],
             "innovation_deviation": lambda: namespace(state.prior_variance).sqrt(
                 state.prior_variance

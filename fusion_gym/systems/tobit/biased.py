@@ -21,6 +21,7 @@ from fusion_gym import validation
 from fusion_gym.core.options import AccessRule, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.tobit.options import (
     FILTERS,
     FeedbackOptions,
@@ -170,13 +171,11 @@ def _build(options: BiasedOscillatorOptions) -> Scenario:
     )
     biases = plant.size - states
     centre = make_centre(options.filter, _FILTERS, options, sensors)
-    names = [f"x{i + 1}" for i in range(states)]
-    names += ["b"] if biases == 1 else [f"b{i + 1}" for i in range(biases)]
-    truth, estimator = make_parts(
-        options, plant, centre, tuple(names), _REFERENCE_HORIZON, model, options.random_start
-    )
+    own = ("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))
+    names, random = numbered_states(states) + own, options.random_start
+    truth, estimator = make_parts(options, plant, centre, names, _REFERENCE_HORIZON, model, random)
     weights = equal_weights(plant.open_loop(horizon))
-    memory = memory_filter_estimator(estimator, options.memory_filter, _FILTERS, options, sensors)
+    memory = memory_filter_estimator(estimator, options.memory_filter, _FILTERS, options)
     return Scenario(
         options,
         truth,

@@ -82,13 +82,11 @@ class Centre(Protocol):
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """Return the expectations under the centre's prediction (n, N), (n, n, N)."""
-        ...
 
     def update(
         self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
     ) -> Gaussian:
         """Return mean (n, N) and covariance (n, n, N) after the grants (sensors, N)."""
-        ...
 
     def local_means(
         self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
@@ -119,9 +117,28 @@ class Centre(Protocol):
         return silent, silent - np.stack([trace(own) for own in np.eye(count, dtype=np.bool_)])
 
 
+def information_shares(share: ArrayLike | None, sensors: int) -> Array:
+    """Return the shares (sensors, 1) of the prediction that the nodes get.
+
+    Args:
+        share: w_m > 0 with sum 1 (sensors,), or None for equal shares.
+        sensors: number of sensors.
+
+    Raises:
+        ConfigurationError: a wrong shape, an entry <= 0, or another sum.
+    """
+    if share is None:
+        return np.full((sensors, 1), 1.0 / sensors)
+    weights = validation.array("information_shares", share, (sensors,))
+    if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
+        reason = f"they must be > 0 with sum 1 (their sum is {weights.sum():.6g})"
+        raise forbidden("information_shares", weights, reason)
+    return weights[:, None]
+
+
 @dataclass(frozen=True)
-class Feedback:
-    """The prior that the nodes get from the centre's prediction.
+class NodeCentre(Centre):
+    """A centre with a node filter for each sensor, with feedback of its prediction.
 
     With shares w_m of sum 1, ``share`` (sensors, 1), node m gets the prediction with its covariance
     multiplied by 1/w_m. This is the paper's feedback (51) and local prediction (29) in one: it
@@ -137,39 +154,8 @@ class Feedback:
     Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (28).
     """
 
-    share: Array
-
-    @classmethod
-    def in_full(cls, sensors: int) -> Feedback:
-        """Return the feedback of the whole prediction to every node."""
-        return cls(np.ones((sensors, 1)))
-
-    @classmethod
-    def in_shares(cls, share: ArrayLike | None, sensors: int) -> Feedback:
-        """Return the feedback of shares of the prediction.
-
-        Args:
-            share: w_m > 0 with sum 1 (sensors,), or None for equal shares.
-            sensors: number of sensors.
-
-        Raises:
-            ConfigurationError: a wrong shape, an entry <= 0, or another sum.
-        """
-        if share is None:
-            return cls(np.full((sensors, 1), 1.0 / sensors))
-        weights = validation.array("information_shares", share, (sensors,))
-        if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
-            reason = f"they must be > 0 with sum 1 (their sum is {weights.sum():.6g})"
-            raise forbidden("information_shares", weights, reason)
-        return cls(weights[:, None])
-
-
-@dataclass(frozen=True)
-class NodeCentre(Centre):
-    """A centre with a node filter for each sensor, with feedback."""
-
     filter: NodeFilter
-    feedback: Feedback
+    share: Array
 
     @property
     def predictable(self) -> bool:
@@ -201,7 +187,7 @@ class FeedbackCentre(NodeCentre):
         root = linalg.root(self.sensors.regular(covariance))
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
         deviation = _deviation(self.sensors, expectation, linalg.total(observed * observed))
-        share = self.feedback.share[:, None, None]
+        share = self.share[:, None, None]
         inflated = observed / namespace(share).sqrt(share)
         outcomes = self.filter.outcomes(inflated, expectation, held, time)
         return CentrePrediction(expectation, deviation, root, outcomes)
@@ -210,7 +196,7 @@ class FeedbackCentre(NodeCentre):
         self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
     ) -> Gaussian:
         """See :class:`Centre`; each node uses its planned outcome of a grant or of silence."""
-        outcomes, root, share = _outcomes(prediction), prediction.root, self.feedback.share[:, None]
+        outcomes, root, share = _outcomes(prediction), prediction.root, self.share[:, None]
         both = outcomes.delivered_covariance, outcomes.silent_covariance
         own = namespace(granted).where(granted[:, None, None], *both)
         local = self._shift(prediction, measurement, granted)
@@ -230,7 +216,7 @@ class FeedbackCentre(NodeCentre):
         innovation = measurement - prediction.expectation.value
         delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
         local = namespace(granted).where(granted[:, None], delivered, outcomes.silent_mean)
-        share = self.feedback.share[:, None]
+        share = self.share[:, None]
         return local / namespace(share).sqrt(share)
 
     def variances(
@@ -238,7 +224,7 @@ class FeedbackCentre(NodeCentre):
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; a filter that minimises a bound uses the bound."""
         outcomes, root = _outcomes(prediction), prediction.root
-        share = self.feedback.share[:, None, None]
+        share = self.share[:, None, None]
         covariances = outcomes.silent_covariance / share, outcomes.delivered_covariance / share
         silent, single = (
             linalg.weighted_trace(linalg.congruence(root, fused), weights)
@@ -300,7 +286,7 @@ class FederatedCentre(NodeCentre):
         cross = linalg.matmul(weighted, prior[1])
         total = linalg.matmul(cross, linalg.transpose(weighted))
         noise = sensors.variance * expectation.truncated_variance
-        total = linalg.add_diagonal(total, self.feedback.share[:, None] * noise)
+        total = linalg.add_diagonal(total, self.share[:, None] * noise)
         innovation = measurement - expectation.value
         innovation = namespace(innovation).where(granted[:, None], innovation, 0.0)
         shift = linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))

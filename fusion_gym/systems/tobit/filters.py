@@ -65,11 +65,9 @@ class NodeFilter(Protocol):
     @property
     def sensors(self) -> CensoredSensors:
         """The sensors of the nodes."""
-        ...
 
     def expect(self, mean: Array) -> Expectation:
         """Return the predicted measurements from prior means (n, N) or (sensors, n, N)."""
-        ...
 
     def outcomes(
         self, matrix: Array, expectation: Expectation, held: Array, time: Array
@@ -82,7 +80,6 @@ class NodeFilter(Protocol):
             held: the last delivered measurement (sensors, m, N).
             time: the number of the step in its episode (N,), counted from 1.
         """
-        ...
 
 
 def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tuple[Array, Array]:

@@ -14,7 +14,6 @@ from fusion_gym.errors import ConfigurationError, forbidden
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, Gaussian, Packets
 from fusion_gym.systems.tobit.filters import KalmanFilter
-from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 
@@ -63,12 +62,8 @@ class HoldCentre(Centre):
         matrix, transition = self.sensors.stacked_matrix[..., 0], self.plant.transition[..., 0]
         channels, n = matrix.shape
         still: Array = np.eye(n)
-        motion: Array = np.block(
-            [
-                [transition, np.zeros((n, channels))],
-                [matrix @ (transition - still), np.eye(channels)],
-            ]
-        )
+        state = [transition, np.zeros((n, channels))]
+        motion: Array = np.block([state, [matrix @ (transition - still), np.eye(channels)]])
         both = np.concatenate([still, matrix])[..., None]
         return motion[..., None], linalg.congruence(both, self.plant.process_covariance)
 
@@ -83,7 +78,10 @@ class HoldCentre(Centre):
         """See :class:`Centre`; the estimate stays."""
         before = state.prediction
         if before is None:
-            before = self.predict(*self._start(state), state.held, state.time)
+            runs, plant = state.mean.shape[-1], self.plant
+            first = (plant.initial_mean, plant.initial_covariance)
+            mean, covariance = (np.repeat(values, runs, axis=-1) for values in first)
+            before = self.predict(mean, covariance, state.held, state.time)
         transition, noise = self.motion
         moment = self._delivered(before.moment, state.age == 0.0)
         moment = linalg.congruence(transition, moment) + noise
@@ -97,11 +95,6 @@ class HoldCentre(Centre):
         held = np.where(granted[:, None], measurement, prediction.held)
         mean = linalg.matvec(self.inverse, held.reshape(-1, held.shape[-1]))
         return mean, self._covariance(self._delivered(prediction.moment, granted))
-
-    def _start(self, state: Any) -> Gaussian:
-        runs = state.mean.shape[-1]
-        mean, covariance = self.plant.initial_mean, self.plant.initial_covariance
-        return np.repeat(mean, runs, axis=-1), np.repeat(covariance, runs, axis=-1)
 
     def _predict(self, prior: Gaussian, held: Array, moment: Array) -> CentrePrediction:
         expectation, root = self.filter.expect(prior[0]), linalg.root(prior[1])
@@ -134,21 +127,16 @@ def _unit_free(sensors: CensoredSensors) -> tuple[Array, Array, Array]:
     return matrix / size, size, deviation
 
 
-def hold_centre(
-    options: FeedbackOptions, sensors: CensoredSensors, plant: LinearPlant
-) -> HoldCentre:
+def hold_centre(sensors: CensoredSensors, plant: LinearPlant) -> HoldCentre:
     """Return the centre of ``filter="hold"``.
 
     Args:
-        options: options of the environment.
         sensors: the sensors.
         plant: the plant of the model.
 
     Raises:
-        ConfigurationError: an option of the nodes' fusion, censored sensors, or sensors that do not
-            determine the state.
+        ConfigurationError: censored sensors, or sensors that do not determine the state.
     """
-    refuse_fusion(options, "hold")
     rank = int(np.linalg.matrix_rank(_unit_free(sensors)[0]))
     if rank < plant.size:
         raise ConfigurationError(

@@ -11,12 +11,10 @@ from fusion_gym.systems.tobit.centre import (
     Centre,
     CentrePrediction,
     FederatedCentre,
-    Feedback,
     Gaussian,
     Packets,
 )
 from fusion_gym.systems.tobit.filters import KalmanFilter, joint_update
-from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
 
@@ -75,17 +73,15 @@ class JointCentre(FederatedCentre):
     local_means = Centre.local_means
 
 
-def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:
+def joint_centre(sensors: CensoredSensors) -> JointCentre:
     """Return the centre of ``filter="joint"``.
 
     Args:
-        options: options of the environment.
         sensors: the sensors.
 
     Raises:
-        ConfigurationError: an option of the nodes' fusion, or more than 100 channels.
+        ConfigurationError: more than 100 channels.
     """
-    refuse_fusion(options, "joint")
     channels = sensors.noise_channels
     if channels > _MOST_CHANNELS:
         raise ConfigurationError(
@@ -93,4 +89,4 @@ def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCen
             f"channels: together they may have at most {_MOST_CHANNELS}, because a step costs "
             "their cube; with independent noises 'kalman' is the same filter"
         )
-    return JointCentre(KalmanFilter(sensors), Feedback.in_full(sensors.count))
+    return JointCentre(KalmanFilter(sensors), np.ones((sensors.count, 1)))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, plain_options
 from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.silence import Trigger
 from fusion_gym.systems.tobit.hold import HoldCentre, hold_centre
 from fusion_gym.systems.tobit.joint import JointCentre, joint_centre
@@ -36,10 +37,10 @@ _FILTERS = {
     "tobit": at_the_nodes(TobitKalmanFilter),
     "adf": FILTERS["adf"],
     "stochastic": FILTERS["stochastic"],
-    "joint": Filter(JointCentre, joint_centre, nodes=False),
+    "joint": Filter(JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False),
     "hold": Filter(
         HoldCentre,
-        lambda options, sensors: hold_centre(options, sensors, _plant(options)),
+        lambda options, sensors: hold_centre(sensors, _plant(options)),
         nodes=False,
     ),
     "truncated": Filter(
@@ -162,7 +163,7 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     estimator = replace(estimator, known_start=True)
     holds = choice.filter == "hold"
     kind = "kalman" if holds and choice.memory_filter is None else choice.memory_filter
-    memory = memory_filter_estimator(estimator, kind, _FILTERS, choice, sensors)
+    memory = memory_filter_estimator(estimator, kind, _FILTERS, choice)
     defaults = stochastic_defaults(choice)
     if isinstance(centre, TruncatedCentre):
         defaults |= centre.silence.policy_defaults
@@ -205,7 +206,7 @@ def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
 def _names(value: Any, states: int) -> tuple[str, ...]:
     """Return the states' names, by default x1, x2 and so on."""
     if value is None:
-        return tuple(f"x{i + 1}" for i in range(states))
+        return numbered_states(states)
     listed = isinstance(value, (list, tuple)) and len(value) == len(set(map(repr, value))) == states
     if not listed or not all(isinstance(name, str) and name.isidentifier() for name in value):
         words = f"a list of {states} different words of letters, digits and '_'"

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym.core.nature import Nature
@@ -16,15 +17,15 @@ from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.centre import (
     Centre,
     FederatedCentre,
-    Feedback,
     FeedbackCentre,
     SequentialCentre,
+    information_shares,
 )
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import choice, not_negative
+from fusion_gym.validation import choice
 
 _OF_FUSION = ("fusion", "information_shares", "order")
 _STRUCTURE = Structure(
@@ -91,9 +92,13 @@ def make_centre(
         ConfigurationError: an unknown filter, or an option of another filter.
     """
     choice("filter", kind, filters)
+    where = f"filter={kind!r}"
     for name, row in filters.items():
         if name != kind:
-            _refuse(options, row.own, f"filter={kind!r}", f"filter={name!r}")
+            _refuse(options, row.own, where, f"filter={name!r}")
+    if not filters[kind].nodes:
+        belongs = "a filter with nodes (here the centre uses the measurements)"
+        _refuse(options, _OF_FUSION, where, belongs)
     return filters[kind].make(options, sensors)
 
 
@@ -139,7 +144,6 @@ def memory_filter_estimator(
     kind: str | None,
     filters: Mapping[str, Filter],
     options: FeedbackOptions,
-    sensors: CensoredSensors,
 ) -> CensoredEstimator | None:
     """Return the estimator with the filter of the option ``memory_filter``, or ``None``.
 
@@ -150,7 +154,6 @@ def memory_filter_estimator(
         kind: name of the memory's filter, or None.
         filters: the table of filters.
         options: options of the environment.
-        sensors: the sensors.
 
     Raises:
         ConfigurationError: an unknown filter, or a missing option.
@@ -161,7 +164,8 @@ def memory_filter_estimator(
     changed: dict[str, Any] = {"filter": kind}
     if not row.nodes:
         changed |= dict.fromkeys(_OF_FUSION)
-    return replace(estimator, centre=row.make(replace(options, **changed), sensors))
+    made = row.make(replace(options, **changed), estimator.centre.sensors)
+    return replace(estimator, centre=made)
 
 
 def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
@@ -176,30 +180,15 @@ def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
     """
     sensors = node.sensors.count
     kind = "federated" if options.fusion is None else options.fusion
-    weights, states = options.state_weights, node.sensors.measurement_matrix.shape[2]
-    if weights is not None:
-        weights = not_negative("state_weights", weights, (states,))
+    weights = options.own_weights(node.sensors.measurement_matrix.shape[2])
     fusion = choose_rule(kind, _STRUCTURE, sensors, options.order, weights)
     if kind == "federated":
-        feedback = Feedback.in_shares(options.information_shares, sensors)
+        share = information_shares(options.information_shares, sensors)
         if isinstance(node, KalmanFilter):
-            return FederatedCentre(node, feedback)
-        return FeedbackCentre(node, feedback, fusion)
+            return FederatedCentre(node, share)
+        return FeedbackCentre(node, share, fusion)
     _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
-    return FeedbackCentre(node, Feedback.in_full(sensors), fusion)
-
-
-def stochastic_centre(values: FeedbackOptions, sensors: CensoredSensors) -> Centre:
-    """Return the centre of ``filter="stochastic"``.
-
-    Args:
-        values: options of the environment.
-        sensors: the sensors.
-
-    Raises:
-        ConfigurationError: a weight that is missing or not allowed, or an option that does not fit.
-    """
-    return feedback_centre(values, StochasticEventFilter.create(sensors, values.stochastic_weight))
+    return FeedbackCentre(node, np.ones((sensors, 1)), fusion)
 
 
 def stochastic_defaults(options: FeedbackOptions) -> dict[str, dict[str, Any]]:
@@ -209,39 +198,21 @@ def stochastic_defaults(options: FeedbackOptions) -> dict[str, dict[str, Any]]:
     return {"stochastic_event": {"weight": plain_options(options.stochastic_weight)}}
 
 
-def assumed_density_centre(options: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:
-    """Return the centre of ``filter="adf"``.
-
-    Args:
-        options: options of the environment.
-        sensors: the sensors.
-
-    Raises:
-        ConfigurationError: an option of the nodes' fusion.
-    """
-    refuse_fusion(options, "adf")
-    return SequentialCentre(AssumedDensityFilter(sensors))
-
-
-def refuse_fusion(options: FeedbackOptions, kind: str) -> None:
-    """Refuse options of the nodes' fusion for a filter without nodes.
-
-    Args:
-        options: options of the environment.
-        kind: the filter's name.
-
-    Raises:
-        ConfigurationError: such an option is set.
-    """
-    belongs = "a filter with nodes (here the centre uses the measurements)"
-    _refuse(options, _OF_FUSION, f"filter={kind!r}", belongs)
-
-
 # What every environment of the family offers; each adds its paper's own.
 FILTERS = {
     "kalman": at_the_nodes(KalmanFilter),
-    "adf": Filter(AssumedDensityFilter, assumed_density_centre, nodes=False),
-    "stochastic": Filter(StochasticEventFilter, stochastic_centre, own=("stochastic_weight",)),
+    "adf": Filter(
+        AssumedDensityFilter,
+        lambda _, sensors: SequentialCentre(AssumedDensityFilter(sensors)),
+        nodes=False,
+    ),
+    "stochastic": Filter(
+        StochasticEventFilter,
+        lambda options, sensors: feedback_centre(
+            options, StochasticEventFilter.create(sensors, options.stochastic_weight)
+        ),
+        own=("stochastic_weight",),
+    ),
 }
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.options import (
     FILTERS,
@@ -146,10 +147,9 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
     if memory_filter is None and options.filter == "paper":
         # The paper's minimises a bound; with every measurement it errs thrice.
         memory_filter = "adf"
-    names = tuple(f"x{i + 1}" for i in range(plant.size))
-    random = options.random_start
+    names, random = numbered_states(plant.size), options.random_start
     truth, estimator = make_parts(options, plant, centre, names, horizon, random_start=random)
-    memory = memory_filter_estimator(estimator, memory_filter, _FILTERS, options, sensors)
+    memory = memory_filter_estimator(estimator, memory_filter, _FILTERS, options)
     defaults = {"dynamic_event": trigger} | stochastic_defaults(options)
     return Scenario(
         options,
@@ -217,17 +217,13 @@ def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> Non
 
 def _trigger(options: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
     """Return the parameters of the dynamic event trigger, one number per sensor."""
-    arguments: dict[str, Any] = {
-        "threshold": options.trigger_threshold,
-        "decay": options.trigger_decay,
-        "divisor": options.trigger_divisor,
-        "initial": options.trigger_initial,
-    }
     paper = {"threshold": (0.1, 0.2, 0.3), "decay": (0.1, 0.2, 0.1)}
     result = {}
-    for name, value in arguments.items():
+    for name in ("threshold", "decay", "divisor", "initial"):
+        field = f"trigger_{name}"
+        value = getattr(options, field)
         if value is None and name in paper:
             value = np.resize(paper[name], sensors)
-        values = validation.not_negative(f"trigger_{name}", value, (sensors,))
+        values = validation.not_negative(field, value, (sensors,))
         result[name] = tuple(values.tolist())
     return result

@@ -21,13 +21,13 @@ from fusion_gym.core.options import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.importing import require
 from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.parts import Truth
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
 from fusion_gym.systems.tobit.system import (
     SIGNALS,
     CensoredEstimate,
     CensoredEstimator,
     CensoredPlant,
-    CensoredTruth,
 )
 from fusion_gym.validation import number, read_text
 
@@ -96,26 +96,26 @@ class RecordedPlant(CensoredPlant):
         """Normals of a start, and the time of day."""
         return super().start_channels + 1
 
-    def start(self, noise: Array) -> tuple[CensoredTruth, Announcement]:
+    def start(self, noise: Array) -> tuple[Truth, Announcement]:
         """See :class:`Plant`; the last normal is the time of day."""
         first = 2 * self.dynamics.size
         own = noise[first : first + self.sensor_count]
         state, mean = super().start(np.nan_to_num(noise[:-1]))
         return self._with_gaps(state, own), Announcement(mean, noise[-1])
 
-    def sense(self, state: CensoredTruth, noise: Array) -> CensoredTruth:
+    def sense(self, state: Truth, noise: Array) -> Truth:
         """See :class:`Plant`."""
         own = noise[self.dynamics.noise_channels :]
         return self._with_gaps(super().sense(state, np.nan_to_num(noise)), own)
 
-    def available(self, state: CensoredTruth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def available(self, state: Truth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """See :class:`Plant`; lagged states have no truth of their own."""
         present = np.isfinite(state.measurement[:, 0])
         known = np.zeros(state.truth.shape, dtype=np.bool_)
         known[: self.sensor_count] = present
         return present, known
 
-    def _with_gaps(self, state: CensoredTruth, own: Array) -> CensoredTruth:
+    def _with_gaps(self, state: Truth, own: Array) -> Truth:
         measurement = np.where(np.isfinite(own)[:, None], state.measurement, np.nan)
         return replace(state, measurement=measurement)
 

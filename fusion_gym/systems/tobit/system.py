@@ -12,45 +12,32 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Estimator, Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    Block,
-    Signal,
-    age_block,
-    common_signals,
-    numbered,
-    sensed,
-)
+from fusion_gym.core.estimator import Reception, SignalValues
+from fusion_gym.core.knowledge import Block, Signal, age_block, common_signals, numbered, sensed
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.plant import Plant
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
-from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, Feedback
+from fusion_gym.systems.parts import (
+    RANGE,
+    AdoptingEstimator,
+    Deliveries,
+    NormalPlant,
+    SensorPlant,
+    Truth,
+    prior_block,
+    variance_block,
+)
+from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _TINY = float(np.finfo(float).tiny)  # stands for a variance of zero
-_RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
-
-
-@dataclass(slots=True)
-class CensoredTruth:
-    """The true state of N runs at one time; n states, l sensors, m components.
-
-    ``truth`` (n, N) · ``measurement`` (l, m, N) · ``departure`` (4, N) of the truth from the model,
-    if any.
-    """
-
-    truth: Array
-    measurement: Array
-    departure: Array | None = None
 
 
 @dataclass(frozen=True)
-class CensoredPlant(Plant[CensoredTruth]):
+class CensoredPlant(SensorPlant[Truth], NormalPlant):
     """A linear plant and censored sensors.
 
     ``random_start`` draws the direction of the initial mean uniformly and announces it. For the
@@ -63,16 +50,6 @@ class CensoredPlant(Plant[CensoredTruth]):
     random_start: bool = False
     nature: Nature = AS_ASSUMED
     numpy_only = None
-
-    @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.sensors.count
-
-    @property
-    def noise_channels(self) -> int:
-        """Normals of one step: process noise, then the sensors'."""
-        return self.dynamics.noise_channels + self.sensors.noise_channels
 
     @property
     def start_channels(self) -> int:
@@ -99,7 +76,7 @@ class CensoredPlant(Plant[CensoredTruth]):
                 result[state] = (min(before[0], ends[0]), max(before[1], ends[1]))
         return result
 
-    def start(self, noise: Array) -> tuple[CensoredTruth, Any]:
+    def start(self, noise: Array) -> tuple[Truth, Any]:
         """Draw the initial state, and announce its mean (n, N)."""
         n = self.dynamics.size
         noise, departure = self.nature.begin(noise)
@@ -110,9 +87,10 @@ class CensoredPlant(Plant[CensoredTruth]):
             mean = xp.sqrt(linalg.dot(mean, mean)) * direction
         truth = self.dynamics.start(mean, noise[n : 2 * n])
         own = true_noise(departure, noise[:0], noise[2 * n :])[1]
-        return CensoredTruth(truth, self.sensors.measure(truth, own, departure), departure), mean
+        measurement = self.sensors.measure(truth, own, departure)
+        return Truth(truth, measurement, departure), mean
 
-    def sense(self, state: CensoredTruth, noise: Array) -> CensoredTruth:
+    def sense(self, state: Truth, noise: Array) -> Truth:
         """Move the plant, and measure.
 
         Source: tobit_token_bucket, equations (1) and (2).
@@ -120,18 +98,8 @@ class CensoredPlant(Plant[CensoredTruth]):
         r, departure = self.dynamics.noise_channels, state.departure
         process, own = true_noise(departure, noise[:r], noise[r:])
         truth = self.dynamics.advance(state.truth, process, departure)
-        return CensoredTruth(truth, self.sensors.measure(truth, own, departure), departure)
-
-    @property
-    def draw_channels(self) -> int:
-        """Number of states."""
-        return self.dynamics.size
-
-    def draw(
-        self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
-    ) -> CensoredTruth:
-        """Draw the truth from N(mean, covariance)."""
-        return CensoredTruth(linalg.draw_normal(mean, covariance, noise), measurement)
+        measurement = self.sensors.measure(truth, own, departure)
+        return Truth(truth, measurement, departure)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) of predictions over t = 1..horizon."""
@@ -150,18 +118,14 @@ class CensoredPlant(Plant[CensoredTruth]):
 
 
 @dataclass(slots=True)
-class CensoredEstimate:
-    """The estimate of N runs at one time; n states, l sensors, m components.
+class CensoredEstimate(Deliveries):
+    """The estimate of N runs at one time; n states.
 
-    ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
-    steps since then · ``time`` (N,), the step in the episode · ``prior_mean`` (n, N),
-    ``prior_covariance`` (n, n, N), the centre's prediction · ``prediction`` of the measurements ·
-    ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior.
+    ``time`` (N,), the step in the episode · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N),
+    the centre's prediction · ``prediction`` of the measurements · ``mean`` (n, N), ``covariance``
+    (n, n, N), the fused posterior.
     """
 
-    measurement: Array
-    held: Array
-    age: Array
     time: Array
     prior_mean: Array
     prior_covariance: Array
@@ -180,7 +144,7 @@ SIGNALS = (
 
 
 @dataclass(frozen=True)
-class CensoredEstimator(Estimator[CensoredEstimate]):
+class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
     """A centre with or without nodes.
 
     ``model`` is the plant that the filters assume. ``scale`` (n,) divides observed state estimates
@@ -245,8 +209,7 @@ class CensoredEstimator(Estimator[CensoredEstimate]):
             node: Any = cast(Any, centre).filter
             centre = replace(cast(Any, centre), filter=replace(node, sensors=sensors))
         if information_shares is not None:
-            feedback = Feedback(information_shares[:, None])
-            centre = replace(cast(Any, centre), feedback=feedback)
+            centre = replace(cast(Any, centre), share=information_shares[:, None])
         return replace(self, model=model, centre=centre)
 
     @property
@@ -255,12 +218,10 @@ class CensoredEstimator(Estimator[CensoredEstimate]):
         sensors = self.centre.sensors
         nodes = numbered(sensors.count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
-        new = partial(own, knowledge="own", limit=_RANGE)
-        shared = partial(Block, labels=(self.state_names,), node="broadcast", limit=_RANGE)
+        new = partial(own, knowledge="own", limit=RANGE)
         at_threshold = "whether the component is at its threshold"
         uncensored = "predicted probability that the component is not censored"
         moved = "new minus last delivered measurement, over two noise deviations"
-        variance = "logarithm of the predicted variance over its open-loop mean"
         blocks = [
             new("whitened_innovation", "innovation over its predicted deviation", _whitened),
             new("censored", at_threshold, lambda s: sensors.censored(s.measurement), limit=None),
@@ -276,18 +237,8 @@ class CensoredEstimator(Estimator[CensoredEstimate]):
                 lambda s: sensed(s.prediction).expectation.uncensored_probability,
             ),
             age_block(nodes),
-            shared(
-                "log_variance",
-                variance,
-                self._log_variance,
-                constants={"open-loop mean": self.reference},
-            ),
-            shared(
-                "estimate",
-                "prediction over the state's root mean square",
-                lambda s: s.prior_mean / self.scale[:, None],
-                constants={"root mean square": self.scale},
-            ),
+            variance_block(self._log_variance, self.state_names, self.reference),
+            prior_block(self.state_names, self.scale),
         ]
         if sensors.unlimited:  # these two would say nothing
             blocks = [block for block in blocks if block.name not in _OF_CENSORING]
@@ -330,10 +281,6 @@ class CensoredEstimator(Estimator[CensoredEstimate]):
             prediction=prediction,
         )
 
-    def observe(self, state: CensoredEstimate, measurement: Array) -> CensoredEstimate:
-        """Take the measurement."""
-        return replace(state, measurement=measurement)
-
     def update(self, state: CensoredEstimate, reception: Reception) -> CensoredEstimate:
         """Update nodes and centre with the measurements that arrive.
 
@@ -370,16 +317,12 @@ class CensoredEstimator(Estimator[CensoredEstimate]):
             return self.centre.variances(prior, sensed(state.prediction), self.state_weights)
 
         return {
-            "measurement": state.measurement,
+            **super().read(state, failure),
             "innovation": lambda: state.measurement - expectation.value,
             "censored": lambda: self.centre.sensors.censored(state.measurement),
-            "held": state.held,
-            "age": state.age,
             "expected_measurement": expectation.value,
             "innovation_deviation": deviation,
             "uncensored_probability": expectation.uncensored_probability,
-            "prior_mean": state.prior_mean,
-            "prior_covariance": state.prior_covariance,
             "silent_variance": lambda: variances()[0],
             "variance_reduction": lambda: variances()[1],
         }
@@ -391,20 +334,10 @@ class CensoredEstimator(Estimator[CensoredEstimate]):
         )
         return now - usual
 
-    def adopt(
-        self, state: CensoredEstimate, mean: Array, covariance: Array, runs: NDArray[np.bool_]
-    ) -> CensoredEstimate:
-        """Replace the estimate of the centre, and by feedback of the nodes, in ``runs`` (N,)."""
-        return replace(
-            state,
-            mean=np.where(runs, mean, state.mean),
-            covariance=np.where(runs, covariance, state.covariance),
-        )
-
     def local_means(self, state: CensoredEstimate) -> Array:
         """Return the nodes' posterior means (sensors, n, N) before the feedback."""
         if state.prediction is None:
-            return np.broadcast_to(state.mean, (len(state.age), *state.mean.shape))
+            return super().local_means(state)
         prior, arrived = (state.prior_mean, state.prior_covariance), state.age == 0.0
         return self.centre.local_means(prior, state.prediction, state.measurement, arrived)
 

@@ -15,12 +15,10 @@ from fusion_gym.systems.tobit.centre import (
     Centre,
     CentrePrediction,
     FederatedCentre,
-    Feedback,
     Gaussian,
     Packets,
 )
 from fusion_gym.systems.tobit.filters import KalmanFilter
-from fusion_gym.systems.tobit.options import refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _ROUNDS = 2  # a third changes errors by less than a thousandth
@@ -134,15 +132,13 @@ def truncated_centre(options: Any, sensors: CensoredSensors) -> TruncatedCentre:
         sensors: the sensors.
 
     Raises:
-        ConfigurationError: an option of the nodes' fusion, censored sensors, a trigger that is
-            missing or measures several channels together, or a threshold that is not allowed.
+        ConfigurationError: censored sensors, a trigger that is missing or measures several channels
+            together, or a threshold that is not allowed.
     """
-    refuse_fusion(options, "truncated")
     if not sensors.unlimited:
         allowed = "'kalman', 'tobit' or 'adf' with censored sensors"
         raise refusal("filter", "truncated", allowed)
     silence = Silence.create(
         options.trigger, options.trigger_threshold, sensors.count, sensors.size
     )
-    feedback = Feedback.in_full(sensors.count)
-    return TruncatedCentre(KalmanFilter(sensors), feedback, silence)
+    return TruncatedCentre(KalmanFilter(sensors), np.ones((sensors.count, 1)), silence)

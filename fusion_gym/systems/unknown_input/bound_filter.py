@@ -139,6 +139,6 @@ def _radius(joint: JointGain, model: InputModel, epsilon: Array, noise: Array) -
             break
     seen = linalg.matmul(gain[:, : model.size], joint.sensors.measurement_matrix)
     rest = linalg.identity(model.size) - seen
-    closed = linalg.matmul(rest, model.transition)[..., 0] * np.sqrt(growth[..., 0])
+    closed = linalg.matmul(rest, model.plant.transition)[..., 0] * np.sqrt(growth[..., 0])
     radius: Array = np.abs(np.linalg.eigvals(closed)).max(-1)
     return radius

@@ -8,7 +8,7 @@ Information Technology & Electronic Engineering 24, 2023.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal, get_args
 
 import numpy as np
@@ -21,6 +21,7 @@ from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.errors import forbidden
 from fusion_gym.fusion.table import Structure, choose_rule
+from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
 from fusion_gym.systems.unknown_input.filters import ExactInputStateFilter, RandomWalkInputFilter
@@ -40,6 +41,7 @@ from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEst
 from fusion_gym.validation import ConfigurationError
 
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
+_SHAPE = ("input_amplitude", "input_period", "input_phase")  # of a signal by its name
 Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
@@ -196,11 +198,10 @@ def _with_memory_filter(
 
     The paper's filter, which minimises a bound, uses the random walk's.
     """
-    kind = options.memory_filter
+    usual = "random_walk" if options.filter == "paper" else None
+    kind = usual if options.memory_filter is None else options.memory_filter
     if kind is None:
-        if options.filter != "paper":
-            return None
-        kind = "random_walk"
+        return None
     validation.choice("memory_filter", kind, FILTERS)
     other = replace(options, filter=kind, hold_variance=None)
     return replace(estimator, nodes=_nodes(other, plant, estimator.nodes.sensors, horizon))
@@ -213,24 +214,14 @@ def _with_example(options: UnknownInputOptions) -> UnknownInputOptions:
     kind = options.input_signal
     if isinstance(kind, str):
         validation.choice("input_signal", kind, get_args(Signal))
-        shape = zip(
-            ("input_amplitude", "input_period", "input_phase"),
-            example["signals"][kind],
-            strict=True,
-        )
-        numbers |= dict(shape)
+        numbers |= zip(_SHAPE, example["signals"][kind], strict=True)
     if options.transition is not None or options.initial_mean is not None:
         numbers.pop("initial_half_width", None)
-    missing = {
-        field.name: numbers[field.name]
-        for field in fields(options)
-        if field.name in numbers and getattr(options, field.name) is None
-    }
+    missing = {name: value for name, value in numbers.items() if getattr(options, name) is None}
     return replace(options, **missing)
 
 
 def _plant(options: UnknownInputOptions) -> UnknownInputPlant:
-    half = options.initial_half_width
     return UnknownInputPlant.create(
         _required(options.transition),
         _required(options.input_matrix),
@@ -238,7 +229,7 @@ def _plant(options: UnknownInputOptions) -> UnknownInputPlant:
         options.sampling_period,
         _required(options.initial_mean),
         _required(options.initial_covariance),
-        half,
+        options.initial_half_width,
     )
 
 
@@ -250,9 +241,7 @@ def _required(value: ArrayLike | None) -> ArrayLike:
 
 def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
     kind = options.input_signal
-    shape = {
-        name: getattr(options, name) for name in ("input_amplitude", "input_period", "input_phase")
-    }
+    shape = {name: getattr(options, name) for name in _SHAPE}
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
@@ -282,10 +271,7 @@ def _nodes(
     )
     joint = JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
-    weights = options.state_weights
-    if weights is not None:
-        size = plant.size + plant.inputs
-        weights = validation.not_negative("state_weights", weights, (size,))
+    weights = options.own_weights(plant.size + plant.inputs)
     fusion = NodeFusion(rule, plant.size, options.fusion == "ci", weights)
     hold = options.hold_variance
     if hold is not None and kind != "random_walk":
@@ -323,8 +309,9 @@ def _trigger(options: UnknownInputOptions, sensors: int) -> dict[str, tuple[floa
 
 def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Array:
     """w_i = g_i/(Σ g · open loop of i), g = 1 for states and ``input_weight`` for inputs."""
-    if options.state_weights is not None:
-        return validation.not_negative("state_weights", options.state_weights, open_loop.shape)
+    chosen = options.own_weights(len(open_loop))
+    if chosen is not None:
+        return chosen
     share = np.ones(len(open_loop))
     share[len(share) - inputs :] = validation.number(
         "input_weight", options.input_weight, at_least=0.0
@@ -336,5 +323,4 @@ def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Arr
 def _state_names(options: UnknownInputOptions, plant: UnknownInputPlant) -> tuple[str, ...]:
     if options.example == "two_carts" and (plant.size, plant.inputs) == (4, 1):
         return ("position_1", "velocity_1", "position_2", "velocity_2", "force")
-    states = tuple(f"x{i + 1}" for i in range(plant.size))
-    return states + tuple(f"d{i + 1}" for i in range(plant.inputs))
+    return numbered_states(plant.size) + tuple(f"d{i + 1}" for i in range(plant.inputs))

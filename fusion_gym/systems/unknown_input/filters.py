@@ -132,9 +132,6 @@ class RandomWalkInputFilter:
         matrix = self.sensors.measurement_matrix
         cross = linalg.matmul(prior[:, :, :n], linalg.transpose(matrix))
         innovation = linalg.matmul(matrix, cross[:, :n]) + noise
-        if self.sensors.size == 1:
-            gain = cross / innovation
-        else:
-            gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
+        gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
         covariance = prior - linalg.matmul(gain, linalg.transpose(cross))
         return gain, linalg.symmetrise(covariance)

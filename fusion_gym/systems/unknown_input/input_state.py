@@ -60,7 +60,7 @@ class JointGain:
         weight = linalg.matmul(linalg.transpose(u), through)
         target = -linalg.matmul(self.onto, through)
         target[:, : cross.shape[1]] += linalg.matmul(cross, u)
-        if free == 1:
+        if free == 1:  # rounding may make it negative
             choice = target / weight
         else:
             weight = linalg.symmetrise(weight)
@@ -85,15 +85,13 @@ class InputModel:
     model.
 
     Shapes: ``state_rows`` [𝒜, r ℬ] (n, s, 1), ``memory`` (q, 1), ``change`` covariance of [ℬ η + w;
-    η] (s, s, 1), ``transition`` 𝒜 (n, n, 1), ``process_covariance`` 𝒲 (n, n, 1), ``initial_mean``
-    (s, 1), ``initial_covariance`` (s, s, 1).
+    η] (s, s, 1), ``initial_mean`` (s, 1), ``initial_covariance`` (s, s, 1).
     """
 
     state_rows: Array
     memory: Array
     change: Array
-    transition: Array
-    process_covariance: Array
+    plant: UnknownInputPlant
     initial_mean: Array
     initial_covariance: Array
 
@@ -130,8 +128,7 @@ class InputModel:
             state_rows=np.concatenate((plant.transition[..., 0], b * retention), axis=1)[..., None],
             memory=retention[:, None],
             change=noise[..., None],
-            transition=plant.transition,
-            process_covariance=plant.process_covariance,
+            plant=plant,
             initial_mean=np.concatenate((plant.initial_mean, np.zeros((q, 1)))),
             initial_covariance=start[..., None],
         )
@@ -139,7 +136,7 @@ class InputModel:
     @property
     def size(self) -> int:
         """Number of states n."""
-        return self.transition.shape[0]
+        return self.plant.size
 
     def predict(self, mean: Array) -> Array:
         """Return F ẑ (..., s, N) from (..., s, N)."""
@@ -168,7 +165,6 @@ class InputModel:
 
     def without_input(self, covariance: Array) -> Array:
         """Return Φ = 𝒜 Ξ_x 𝒜ᵀ + 𝒲 (..., n, n, N) from the joint covariance (..., s, s, N)."""
-        n = self.size
-        return (
-            linalg.congruence(self.transition, covariance[..., :n, :n, :]) + self.process_covariance
-        )
+        n, plant = self.size, self.plant
+        moved = linalg.congruence(plant.transition, covariance[..., :n, :n, :])
+        return moved + plant.process_covariance

@@ -222,9 +222,8 @@ class RunNodes(Nodes):
         """Return the estimates before any measurement, equal for all nodes."""
         mean, fused, covariance = self._start(runs)
         every = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape)).copy()
-        return Estimates(
-            mean, fused, every, covariance, self.fusion.start(self.sensors.count, runs)
-        )
+        weights = self.fusion.start(self.sensors.count, runs)
+        return Estimates(mean, fused, every, covariance, weights)
 
     def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
         """See :class:`Nodes`."""

@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
-from fusion_gym.systems.linear_plant import LinearDynamics, covariance_factor
+from fusion_gym.systems.linear_plant import LinearDynamics, covariance_factor, initial_law
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
 _LONGEST_PERIOD = 1000  # small steps between two instants
@@ -69,11 +69,9 @@ class UnknownInputPlant(LinearDynamics):
         n = len(small)
         inputs = validation.array("input_matrix", input_matrix, (n, None))
         process = validation.covariance("process_covariance", process_covariance, n)
-        start = validation.covariance("initial_covariance", initial_covariance, n)
-        mean = validation.array("initial_mean", initial_mean, (n,))
-        half = None
+        law, half = initial_law(initial_mean, initial_covariance, n), None
         if initial_half_width is not None:
-            half = validation.not_negative("initial_half_width", initial_half_width, (n,))
+            half = validation.not_negative("initial_half_width", initial_half_width, (n,))[:, None]
         steps = validation.integer(
             "sampling_period", sampling_period, at_least=1, at_most=_LONGEST_PERIOD
         )
@@ -88,10 +86,8 @@ class UnknownInputPlant(LinearDynamics):
             input_matrix=lifted_inputs[..., None],
             process_covariance=lifted_process[..., None],
             process_factor=covariance_factor(lifted_process)[..., None],
-            initial_mean=mean[:, None],
-            initial_covariance=start[..., None],
-            initial_factor=linalg.root(start[..., None]),
-            initial_half_width=None if half is None else half[:, None],
+            **law,
+            initial_half_width=half,
         )
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from fusion_gym import validation
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 
 
@@ -118,11 +118,7 @@ class Sinusoids(InputSignal):
     def value(self, memory: Array, time: Array) -> Array:
         """Return the input (q, N) at the runs' times (N,)."""
         angle = memory.reshape(*self.amplitude.shape[:2], -1) + (2.0 * np.pi / self.period) * time
-        terms = self.amplitude * np.sin(angle)
-        total: Array = terms[:, 0].copy()
-        for term in range(1, terms.shape[1]):
-            total += terms[:, term]
-        return total
+        return linalg.total(self.amplitude * np.sin(angle), 1)
 
     def mean(self, horizon: int) -> Array:
         """Return zero (horizon, q) for random phases, else the signal itself."""
@@ -176,7 +172,12 @@ class _Stationary(InputSignal):
         Raises:
             ConfigurationError: a wrong shape, or a number outside these limits.
         """
-        return cls(*_scale_and_period(size, amplitude, period))
+        scale = validation.positive("input_amplitude", amplitude, (size,))
+        instants = validation.positive("input_period", period, (size,))
+        if np.any(instants < 1.0):
+            allowed = ">= 1 everywhere, because an input is constant between two sampling instants"
+            raise validation.refusal("input_period", instants, allowed)
+        return cls(scale[:, None], instants[:, None])
 
     @property
     def size(self) -> int:
@@ -196,6 +197,12 @@ class _Stationary(InputSignal):
         """Return the values (q, N)."""
         return memory
 
+    def _geometric(self, ratio: Array, horizon: int) -> Array:
+        """Return a² ratio^lag (horizon, q, q) on the diagonal."""
+        own = self.amplitude**2 * ratio ** np.arange(horizon)
+        result: Array = own.T[:, :, None] * np.eye(self.size)
+        return result
+
 
 @dataclass(frozen=True)
 class Steps(_Stationary):
@@ -213,7 +220,7 @@ class Steps(_Stationary):
 
     def covariance(self, horizon: int) -> Array:
         """Return (horizon, q, q): a² (1 - 1/period)^lag on the diagonal."""
-        return _geometric(self.amplitude, 1.0 - 1.0 / self.period, horizon)
+        return self._geometric(1.0 - 1.0 / self.period, horizon)
 
 
 @dataclass(frozen=True)
@@ -235,22 +242,7 @@ class MeanRevertingWalk(_Stationary):
 
     def covariance(self, horizon: int) -> Array:
         """Return (horizon, q, q): a² exp(-lag/period) on the diagonal."""
-        return _geometric(self.amplitude, np.exp(-1.0 / self.period), horizon)
-
-
-def _scale_and_period(size: int, amplitude: ArrayLike, period: ArrayLike) -> tuple[Array, Array]:
-    scale = validation.positive("input_amplitude", amplitude, (size,))
-    instants = validation.positive("input_period", period, (size,))
-    if np.any(instants < 1.0):
-        allowed = ">= 1 everywhere, because an input is constant between two sampling instants"
-        raise validation.refusal("input_period", instants, allowed)
-    return scale[:, None], instants[:, None]
-
-
-def _geometric(amplitude: Array, ratio: Array, horizon: int) -> Array:
-    own = amplitude**2 * ratio ** np.arange(horizon)
-    result: Array = own.T[:, :, None] * np.eye(len(amplitude))
-    return result
+        return self._geometric(np.exp(-1.0 / self.period), horizon)
 
 
 @dataclass(frozen=True)

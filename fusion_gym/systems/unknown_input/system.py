@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Estimator, Reception, SignalValues
+from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import (
     Block,
     age_block,
@@ -23,35 +23,30 @@ from fusion_gym.core.knowledge import (
     sensed,
 )
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.plant import Plant
 from fusion_gym.systems.linear_plant import largest_ratio
+from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.sensors import InputSensors
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
-_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 _IMAGINED = 32  # signals of which one is taken, where one is imagined
 
 
 @dataclass(slots=True)
-class UnknownInputTruth:
-    """The true state of N runs at one time; n states, q inputs, s = n + q, l sensors, m components.
+class UnknownInputTruth(Truth):
+    """The true state of N runs at one time; the truth is [x(k); d(k - 1)].
 
-    ``truth`` (s, N), the state x(k) and the input d(k - 1) that has just acted · ``signal``
-    (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since the start ·
-    ``measurement`` (l, m, N) · ``departure`` (4, N) of the truth from the model, if any.
+    ``signal`` (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since
+    the start.
     """
 
-    truth: Array
     signal: Array
     time: Array
-    measurement: Array
-    departure: Array | None = None
 
 
 @dataclass(frozen=True)
-class DrivenPlant(Plant[UnknownInputTruth]):
+class DrivenPlant(SensorPlant[UnknownInputTruth]):
     """A linear plant under an input signal, with its sensors.
 
     One step is one sampling instant. ``nature`` is the departure of the truth from this model.
@@ -64,15 +59,9 @@ class DrivenPlant(Plant[UnknownInputTruth]):
     nature: Nature = AS_ASSUMED
 
     @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.sensors.count
-
-    @property
     def noise_channels(self) -> int:
         """Normals of one step: input, process noise, sensors."""
-        own = self.dynamics.noise_channels + self.sensors.noise_channels
-        return self.signal.noise_channels + own
+        return self.signal.noise_channels + super().noise_channels
 
     @property
     def start_channels(self) -> int:
@@ -152,6 +141,7 @@ class DrivenPlant(Plant[UnknownInputTruth]):
             signal=self.signal.advance(memory, moving),
             time=time,
             measurement=measurement,
+            departure=None,
         )
 
     def open_loop(self, horizon: int) -> Array:
@@ -168,17 +158,13 @@ class DrivenPlant(Plant[UnknownInputTruth]):
 
 
 @dataclass(slots=True)
-class UnknownInputEstimate:
-    """The estimates of N runs at one time; l sensors, m components.
+class UnknownInputEstimate(Deliveries):
+    """The estimates of N runs at one time.
 
-    ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
-    sampling instants since then · ``time`` (N,), instants since the start · ``estimates``, the
-    posteriors · ``prediction``, the predictions.
+    ``time`` (N,), sampling instants since the start · ``estimates``, the posteriors ·
+    ``prediction``, the predictions.
     """
 
-    measurement: Array
-    held: Array
-    age: Array
     time: Array
     estimates: Estimates
     prediction: NodePrediction | None
@@ -193,19 +179,13 @@ SIGNALS = common_signals(
 
 
 @dataclass(frozen=True)
-class UnknownInputEstimator(Estimator[UnknownInputEstimate]):
+class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
     """Nodes with a fusion centre, without feedback.
 
     The estimated quantity is [x(k); d(k - 1)]: an input becomes observable only after it has acted.
-    ``state_weights`` (s,) weigh the traces among the signals, ``magnitude`` (s,) divides observed
-    estimates, and ``reference`` (s,) observed variances.
     """
 
     nodes: Nodes
-    state_names: tuple[str, ...]
-    state_weights: Array
-    magnitude: Array
-    reference: Array
     signals = SIGNALS
 
     @property
@@ -221,13 +201,10 @@ class UnknownInputEstimator(Estimator[UnknownInputEstimate]):
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation; a "state" is a state or an input."""
-        nodes, states = (numbered(self.nodes.sensors.count),), (self.state_names,)
-        own = partial(Block, node="own", limit=_RANGE)
-        new = partial(own, labels=(*nodes, numbered(self.nodes.sensors.size)), knowledge="own")
-        fused = partial(Block, labels=states, limit=_RANGE)
+        nodes = numbered(self.nodes.sensors.count)
+        labels = (nodes, numbered(self.nodes.sensors.size))
+        new = partial(Block, labels=labels, knowledge="own", node="own", limit=RANGE)
         innovation = "innovation of the node over its predicted deviation"
-        deviation = "logarithm of the node's predicted over the open-loop deviation"
-        open_loop = {"open-loop deviation": np.sqrt(self.reference)}
         return (
             new("whitened_innovation", innovation, self._whitened),
             new(
@@ -236,25 +213,21 @@ class UnknownInputEstimator(Estimator[UnknownInputEstimate]):
                 lambda s: (s.measurement - s.held) / self._noise_deviation,
                 constants={"√2 noise deviations": self._noise_deviation[..., 0]},
             ),
-            age_block(*nodes),
-            own(
+            age_block(nodes),
+            self.deviation_block(
                 "local_log_deviation",
-                deviation,
+                "logarithm of the node's predicted over the open-loop deviation",
                 self._local_log_deviation,
-                nodes + states,
-                constants=open_loop,
+                nodes,
             ),
-            fused(
+            self.deviation_block(
                 "log_deviation",
                 "logarithm of the last fused over the open-loop deviation",
                 self._log_deviation,
-                constants=open_loop,
             ),
-            fused(
-                "estimate",
+            self.estimate_block(
                 "fused prediction over the root mean square",
-                lambda s: sensed(s.prediction).fused_mean / self.magnitude[:, None],
-                constants={"root mean square": self.magnitude},
+                lambda s: sensed(s.prediction).fused_mean,
             ),
         )
 
@@ -275,10 +248,6 @@ class UnknownInputEstimator(Estimator[UnknownInputEstimate]):
         time = state.time + 1.0
         prediction = self.nodes.predict(state.estimates, time)
         return replace(state, age=state.age + 1.0, time=time, prediction=prediction)
-
-    def observe(self, state: UnknownInputEstimate, measurement: Array) -> UnknownInputEstimate:
-        """Take the measurement."""
-        return replace(state, measurement=measurement)
 
     def update(self, state: UnknownInputEstimate, reception: Reception) -> UnknownInputEstimate:
         """Update the nodes with the measurements that arrive, and fuse.
@@ -302,18 +271,13 @@ class UnknownInputEstimator(Estimator[UnknownInputEstimate]):
         def variances() -> tuple[Array, Array]:
             return self.nodes.variances(state.estimates, prediction, self.state_weights, state.time)
 
-        def everyone(value: Array) -> Array:
-            return np.broadcast_to(value, (*value.shape[:-1], len(state.time)))
-
         return {
-            "measurement": state.measurement,
+            **super().read(state, failure),
             "innovation": lambda: state.measurement - prediction.expected,
-            "held": state.held,
-            "age": state.age,
             "expected_measurement": prediction.expected,
-            "innovation_deviation": lambda: everyone(self._deviation(state)),
+            "innovation_deviation": lambda: _lanes(self._deviation(state), len(state.time)),
             "prior_mean": prediction.fused_mean[: self.nodes.model.size],
-            "prior_covariance": lambda: everyone(self._fused_prior(state)),
+            "prior_covariance": lambda: _lanes(self._fused_prior(state), len(state.time)),
             "silent_variance": lambda: variances()[0],
             "variance_reduction": lambda: variances()[1],
         }

@@ -1,0 +1,172 @@
+"""What plants and estimators of several families share: states, channels, blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.estimator import Estimator, StateT
+from fusion_gym.core.knowledge import Block
+from fusion_gym.core.plant import Plant
+
+RANGE = 5.0  # whitened quantities and logarithms of ratios are clipped here
+
+
+@dataclass(slots=True)
+class Truth:
+    """The true state of N runs at one time; n states, l sensors, m channels.
+
+    ``truth`` (n, N) · ``measurement`` (l, m, N) · ``departure`` (4, N) of the truth from the model,
+    if any.
+    """
+
+    truth: Array
+    measurement: Array
+    departure: Array | None
+
+
+class NormalPlant(Plant[Truth]):
+    """A plant of which a policy imagines nothing but the truth."""
+
+    @property
+    def draw_channels(self) -> int:
+        """Number of states."""
+        return len(self.state_names)
+
+    def draw(
+        self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
+    ) -> Truth:
+        """Draw the truth from N(mean, covariance)."""
+        return Truth(linalg.draw_normal(mean, covariance, noise), measurement, None)
+
+
+@dataclass(slots=True)
+class Deliveries:
+    """What nodes and centre have of l sensors in N runs.
+
+    ``measurement`` (l, m, N) · ``held``, the last delivered one · ``age`` (l, N), steps since then.
+    """
+
+    measurement: Array
+    held: Array
+    age: Array
+
+
+class SensorPlant(Plant[StateT]):
+    """A plant of dynamics and sensors, each with its own normals."""
+
+    dynamics: Any
+    sensors: Any
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        count: int = self.sensors.count
+        return count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: process noise, then the sensors'."""
+        channels: int = self.dynamics.noise_channels + self.sensors.noise_channels
+        return channels
+
+
+class AdoptingEstimator(Estimator[StateT]):
+    """An estimator that continues from the fields ``mean`` and ``covariance`` of its state."""
+
+    def adopt(self, state: StateT, mean: Array, covariance: Array, runs: NDArray[Any]) -> StateT:
+        """See :class:`Estimator`."""
+        before: Any = state
+        adopted: StateT = replace(
+            before,
+            mean=np.where(runs, mean, before.mean),
+            covariance=np.where(runs, covariance, before.covariance),
+        )
+        return adopted
+
+
+@dataclass(frozen=True)
+class ScaledEstimator(Estimator[StateT]):
+    """An estimator whose observation is relative to the open loop.
+
+    ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
+    estimates and ``reference`` (n,) observed variances.
+    """
+
+    state_names: tuple[str, ...]
+    state_weights: Array
+    magnitude: Array
+    reference: Array
+
+    def trace(self, covariance: Array) -> Array:
+        """Return the weighted trace (N,) of a covariance (n, n, N)."""
+        return linalg.weighted_trace(covariance, self.state_weights)
+
+    def estimate_block(self, meaning: str, mean: Callable[[Any], Array]) -> Block:
+        """Return the block of the centre's ``mean`` (n, N) of a state."""
+        return estimate_block(meaning, mean, self.state_names, self.magnitude)
+
+    def deviation_block(
+        self, name: str, meaning: str, value: Callable[[Any], Array], *nodes: tuple[str, ...]
+    ) -> Block:
+        """Return a block of logarithms of deviations, of the centre or of ``nodes``."""
+        return Block(
+            name,
+            meaning,
+            value,
+            (*nodes, self.state_names),
+            node="own" if nodes else "hidden",
+            limit=RANGE,
+            constants={"open-loop deviation": np.sqrt(self.reference)},
+        )
+
+
+def estimate_block(
+    meaning: str,
+    mean: Callable[[Any], Array],
+    names: tuple[str, ...],
+    magnitude: Array,
+    node: Literal["broadcast", "hidden"] = "hidden",
+) -> Block:
+    """Return the block of the centre's ``mean`` (n, N) of a state, over ``magnitude`` (n,)."""
+    return Block(
+        "estimate",
+        meaning,
+        lambda state: mean(state) / magnitude[:, None],
+        (names,),
+        node=node,
+        limit=RANGE,
+        constants={"root mean square": magnitude},
+    )
+
+
+def prior_block(names: tuple[str, ...], magnitude: Array) -> Block:
+    """Return the block of the prediction ``prior_mean``, which is broadcast."""
+    meaning = "prediction over the state's root mean square"
+    return estimate_block(meaning, lambda s: s.prior_mean, names, magnitude, "broadcast")
+
+
+def variance_block(
+    value: Callable[[Any], Array], names: tuple[str, ...], reference: Array
+) -> Block:
+    """Return the block of logarithms of predicted variances over ``reference`` (n,)."""
+    return Block(
+        "log_variance",
+        "logarithm of the predicted variance over its open-loop mean",
+        value,
+        (names,),
+        node="broadcast",
+        limit=RANGE,
+        constants={"open-loop mean": reference},
+    )
+
+
+def numbered_states(size: int, usual: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return the ``usual`` names of the states where they fit, else x1, x2 and so on."""
+    return usual if len(usual) == size else tuple(f"x{i + 1}" for i in range(size))
