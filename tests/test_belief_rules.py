@@ -1,4 +1,4 @@
-"""The rules that look at what is believed: their units, their limits, their figures."""
+"""The rules on beliefs: their units, their limits, their figures."""
 
 import functools
 from typing import Any

@@ -122,7 +122,7 @@ def task_of(name: str) -> Task:
 
 
 def believes(name: str) -> bool:
-    """Whether a policy looks at what is believed, and is tried where that differs."""
+    """Whether a policy reads beliefs, and is tried where they differ."""
     maker = policy_maker(name)
     believing = isinstance(maker, type) and issubclass(maker, BeliefRule)
     return believing or hasattr(maker, "memory_owner") or name == "zoo"

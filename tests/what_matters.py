@@ -71,7 +71,7 @@ class Believed:
 
 
 def read(signals: Signals, policy: Any) -> Values:
-    """All signals; what is believed only for a policy that looks at it, for it takes long."""
+    """All signals; beliefs only for a policy that reads them, because they take long."""
     beliefs = ("beliefs", "own_beliefs", *(signal.name for signal in MEMORY_SIGNALS))
     believes = owner_of(policy) is not None
     result: Values = {name: signals[name] for name in signals if believes or name not in beliefs}

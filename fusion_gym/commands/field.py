@@ -38,7 +38,7 @@ from fusion_gym.evaluation.field_study import (
 from fusion_gym.output.data_card import draw_card
 from fusion_gym.output.field_report import FieldReport, draw_curves, write_report
 from fusion_gym.output.files import read_json, write, write_text
-from fusion_gym.output.folders import check_inputs, held, lock_folder
+from fusion_gym.output.folders import check_inputs, folder_refusal, lock_folder
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.recordings import Recording, fit
 from fusion_gym.recordings.fitting import criticise, deviations, noisy_channels, warnings_of
@@ -90,7 +90,7 @@ class Field(Long):
         inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
         place = self.output / "study.json"
         if place.exists() and not self.resume:
-            raise held(self.output, "a study")
+            raise folder_refusal(self.output, "a study")
         if place.exists():
             check_inputs(inputs, read_json(place, "output"), f"the study in {str(self.output)!r}")
         plant = fit(recording, self.share, self.exact, order=1)  # a hold has no lags

@@ -35,7 +35,7 @@ from fusion_gym.evaluation.rule_search import (
 )
 from fusion_gym.output import tables
 from fusion_gym.output.files import read_json, write
-from fusion_gym.output.folders import check_inputs, held, lock_folder
+from fusion_gym.output.folders import check_inputs, folder_refusal, lock_folder
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.checked import checked
@@ -101,7 +101,7 @@ class Search(EnvironmentOptions, Long):
         path = self.output / _GENERATIONS
         if not self.resume:
             if path.exists() or (self.output / _RESULT).exists():
-                raise held(self.output, "a search")
+                raise folder_refusal(self.output, "a search")
             return []
         if not path.exists():
             place = f"output = {str(self.output)!r}"

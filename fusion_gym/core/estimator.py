@@ -1,4 +1,4 @@
-"""The contract of an estimator: what nodes and fusion centre believe, without the truth."""
+"""The contract of an estimator: local filters and fusion centre, without the truth."""
 
 from __future__ import annotations
 

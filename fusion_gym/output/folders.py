@@ -36,7 +36,7 @@ def lock_folder(folder: Path, name: str) -> Iterator[None]:
         lock.release()
 
 
-def held(folder: Path, results: str) -> ConfigurationError:
+def folder_refusal(folder: Path, results: str) -> ConfigurationError:
     """Return the error of a folder with earlier results."""
     return ConfigurationError(
         f"output = {str(folder)!r} already holds {results}: continue with --resume, or give "

@@ -16,7 +16,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.importing import trust_files
 from fusion_gym.output.files import replacing, write, write_text
-from fusion_gym.output.folders import check_inputs, fingerprint, held, lock_folder
+from fusion_gym.output.folders import check_inputs, fingerprint, folder_refusal, lock_folder
 from fusion_gym.output.progress import progress_bar, quietly, remark, writing
 from fusion_gym.policies.loading import load_model_policy
 from fusion_gym.training.calibration import calibrate
@@ -42,7 +42,7 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
     where, checkpoint = f"the training in {str(folder)!r}", folder / "latest.zip"
     if not resume:
         if holds_training(folder):
-            raise held(folder, "a training")
+            raise folder_refusal(folder, "a training")
         return None
     if checkpoint.exists():
         journal = read_journal(checkpoint)
