@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import functools
 import os
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.knowledge import Block, Signal, sensed
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.options import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
@@ -23,12 +21,7 @@ from fusion_gym.importing import require
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import Truth
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
-from fusion_gym.systems.tobit.system import (
-    SIGNALS,
-    CensoredEstimate,
-    CensoredEstimator,
-    CensoredPlant,
-)
+from fusion_gym.systems.tobit.system import Announcement, CensoredPlant, DailyLevel
 from fusion_gym.validation import number, read_text
 
 _EXAMPLE = ("transition", "process_covariance", "initial_covariance", "measurement_matrices",
@@ -78,13 +71,6 @@ class RecordedFusionOptions(LinearFusionOptions):
         return result
 
 
-class Announcement(NamedTuple):
-    """What an episode announces of its start: the mean (n, N), and the time of day (N,) in days."""
-
-    mean: Array
-    day: Array
-
-
 @dataclass(frozen=True)
 class RecordedPlant(CensoredPlant):
     """A linear plant with gaps in its measurements: a measurement's noise of NaN is a gap."""
@@ -118,104 +104,6 @@ class RecordedPlant(CensoredPlant):
     def _with_gaps(self, state: Truth, own: Array) -> Truth:
         measurement = np.where(np.isfinite(own)[:, None], state.measurement, np.nan)
         return replace(state, measurement=measurement)
-
-
-@dataclass(slots=True)
-class RecordedEstimate(CensoredEstimate):
-    """The estimate of N runs: also the sensors (l, N) with a reading, and the time of day (N,)."""
-
-    available: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
-    day: Array = field(default_factory=lambda: np.empty(0))
-
-
-@dataclass(frozen=True)
-class RecordedEstimator(CensoredEstimator):
-    """Filters of deviations whose signals are readings with level and daily cycle.
-
-    ``level`` (l, 5) has the constant, sine and cosine of one and of two periods a day; ``step`` is
-    a step in days.
-    """
-
-    signals = (
-        *SIGNALS,
-        Signal("sampled", "own", "(sensors, N)", "whether the sensor has a reading"),
-    )
-    level: Array = field(default_factory=lambda: np.empty((0, 5)))
-    step: float = 0.0
-    numpy_only = "log"
-    covariance_cycle = None  # gaps make covariances unpredictable
-
-    @property
-    def observation(self) -> tuple[Block, ...]:
-        """See :class:`Estimator`; exact sensors have no noise deviations to divide by."""
-        scale = self.scale[: self.centre.sensors.count, None, None]
-        return tuple(
-            replace(
-                block,
-                value=lambda s: (s.measurement - s.held) / scale,
-                meaning="new minus last delivered reading, over the state's root mean square",
-                constants={"root mean square": scale[..., 0]},
-            )
-            if block.name == "held_difference"
-            else block
-            for block in super().observation
-        )
-
-    def start(self, measurement: Array, announcement: Any) -> Any:
-        """See :class:`Estimator`; a gap is filled with the expectation."""
-        mean, day = announcement
-        plain = replace(self, known_start=False)
-        first = CensoredEstimator.start(plain, measurement, mean)
-        prior, time = (first.prior_mean, first.prior_covariance), first.time
-        first.prediction = self.centre.predict(*prior, np.nan_to_num(measurement), time)
-        state = self.observe(RecordedEstimate(**_values(first), day=day), measurement)
-        prediction = self.centre.predict(*prior, state.measurement, time)
-        state = replace(state, held=state.measurement, prediction=prediction)
-        result = self.update(state, Reception(np.ones(state.age.shape, dtype=np.bool_)))
-        return replace(result, prediction=None, age=np.zeros_like(state.age))
-
-    def predict(self, state: Any) -> Any:
-        """See :class:`Estimator`; held readings stay while the level moves."""
-        moved = self._level(state, state.time + 1.0) - self._level(state, state.time)
-        return super().predict(replace(state, held=state.held - moved))
-
-    def observe(self, state: Any, measurement: Array) -> Any:
-        """See :class:`Estimator`; a sensor without a reading has the expectation."""
-        available = np.isfinite(measurement[:, 0])
-        expected = sensed(state.prediction).expectation.value
-        filled = np.where(available[:, None], measurement, expected)
-        return replace(state, measurement=filled, available=available)
-
-    def update(self, state: Any, reception: Reception) -> Any:
-        """See :class:`Estimator`; a sensor without a reading delivers nothing."""
-        arrived = reception.arrived & state.available
-        return super().update(state, reception._replace(arrived=arrived))
-
-    def single_deliveries(self, state: Any) -> tuple[Array, Array] | None:
-        """See :class:`Estimator`."""
-        single = super().single_deliveries(state)
-        if single is None:
-            return None
-        silence = Reception(np.zeros_like(state.available))
-        silent = self.update(state, silence).covariance
-        return single[0], np.where(state.available[:, None, None], single[1], silent)
-
-    def read(self, state: Any, failure: Array | None = None) -> SignalValues:
-        """Return the signals, measurements as readings."""
-        signals, level = dict(super().read(state, failure)), self._level(state, state.time)
-        for name in ("measurement", "held", "expected_measurement"):
-            signals[name] = np.asarray(signals[name]) + level
-        reduction: Any = signals["variance_reduction"]
-        return signals | {
-            "sampled": state.available,
-            "variance_reduction": lambda: np.where(state.available, reduction(), 0.0),
-        }
-
-    def _level(self, state: RecordedEstimate, time: Array) -> Array:
-        """Return what readings (l, 1, N) have beside deviations."""
-        turn = 2.0 * np.pi * (state.day + self.step * time)
-        waves = [np.ones_like(turn), np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
-        return (self.level @ np.array(waves))[:, None]
 
 
 @dataclass(frozen=True)
@@ -323,7 +211,7 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
         raise refusal("log", choice.log, "the path of a CSV file")
     share = number("fit_share", choice.fit_share, above=0.0, at_most=0.95)
     scenario = build_linear(choice)
-    truth, memory = scenario.plant, scenario.memory_estimator
+    truth, memory = scenario.plant, cast(Any, scenario.memory_estimator)
     assert isinstance(truth, CensoredPlant)
     plant = truth.dynamics
     if choice.source != "normal":
@@ -349,22 +237,17 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
         "resampled": lambda: ResampledNoise(_residuals(plant, part)),
         "recorded": lambda: _windows(plant, part, choice.horizon),
     }[choice.source]()
-    recorded = RecordedPlant(**_values(truth))
+    recorded = RecordedPlant(**{item.name: getattr(truth, item.name) for item in fields(truth)})
 
-    def estimator(own: Any) -> RecordedEstimator:
-        return RecordedEstimator(**_values(own), level=part.level, step=part.step)
-
+    level = DailyLevel(part.level, part.step)
+    filters: Any = scenario.estimator
     return replace(
         scenario,
         plant=recorded,
-        estimator=estimator(scenario.estimator),
-        memory_estimator=None if memory is None else estimator(memory),
+        estimator=replace(filters, level=level),
+        memory_estimator=None if memory is None else replace(memory, level=level),
         noise=noise,
     )
-
-
-def _values(record: Any) -> dict[str, Any]:
-    return {item.name: getattr(record, item.name) for item in fields(record)}
 
 
 def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:

@@ -9,9 +9,10 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
@@ -117,13 +118,39 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
         return signal, loss
 
 
+class Announcement(NamedTuple):
+    """What a recording announces of its start: the mean (n, N), and the time of day (N,)."""
+
+    mean: Array
+    day: Array
+
+
+@dataclass(frozen=True)
+class DailyLevel:
+    """What readings have beside the plant's deviations.
+
+    ``waves`` (l, 5) has each sensor's constant, sine and cosine of one and of two periods a day;
+    ``step`` is a step in days.
+    """
+
+    waves: Array
+    step: float
+
+    def at(self, day: Array, time: Array) -> Array:
+        """Return the level (l, 1, N) after steps ``time`` (N,) from the times of day (N,)."""
+        turn = 2.0 * np.pi * (day + self.step * time)
+        waves = [np.ones_like(turn), np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
+        return (self.waves @ np.array(waves))[:, None]
+
+
 @dataclass(slots=True)
 class CensoredEstimate(Deliveries):
     """The estimate of N runs at one time; n states.
 
     ``time`` (N,), the step in the episode · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N),
     the centre's prediction · ``prediction`` of the measurements · ``mean`` (n, N), ``covariance``
-    (n, n, N), the fused posterior.
+    (n, n, N), the fused posterior · of a recording the time of day ``day`` (N,) at the start and
+    the sensors ``available`` (l, N) with a reading.
     """
 
     time: Array
@@ -132,6 +159,8 @@ class CensoredEstimate(Deliveries):
     prediction: CentrePrediction | None
     mean: Array
     covariance: Array
+    day: Array | None = None
+    available: NDArray[np.bool_] | None = None
 
 
 _OF_CENSORING = ("censored", "uncensored_probability")
@@ -141,6 +170,7 @@ SIGNALS = (
     Signal("censored", "own", _COMPONENTS, "whether the component is at its threshold"),
     Signal("uncensored_probability", "centre", _COMPONENTS, "predicted P(uncensored)", "own"),
 )
+_SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a reading")
 
 
 @dataclass(frozen=True)
@@ -149,7 +179,8 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
 
     ``model`` is the plant that the filters assume. ``scale`` (n,) divides observed state estimates
     and ``reference`` (n,) observed variances. With ``known_start`` the estimate begins with the
-    first measurement of every sensor.
+    first measurement of every sensor. With ``level`` the measurements are deviations of readings
+    from it, and a measurement of NaN is a gap.
     """
 
     model: LinearPlant
@@ -158,7 +189,12 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
     scale: Array
     reference: Array
     known_start: bool = False
-    signals = SIGNALS
+    level: DailyLevel | None = None
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:  # type: ignore[override]
+        """See :class:`Estimator`."""
+        return SIGNALS if self.level is None else (*SIGNALS, _SAMPLED)
 
     @property
     def numpy_only(self) -> str | None:  # type: ignore[override]
@@ -175,9 +211,9 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         """See :class:`Estimator`; Kalman filters without censoring have one.
 
         With federated fusion, or one filter at the centre, the covariances are then the actual ones
-        if ``model`` is the plant; with covariance intersection they are bounds.
+        if ``model`` is the plant; with covariance intersection they are bounds. Gaps have none.
         """
-        return 1 if self.centre.predictable else None
+        return 1 if self.centre.predictable and self.level is None else None
 
     @property
     def state_weights(self) -> Array:
@@ -221,15 +257,18 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         new = partial(own, knowledge="own", limit=RANGE)
         at_threshold = "whether the component is at its threshold"
         uncensored = "predicted probability that the component is not censored"
-        moved = "new minus last delivered measurement, over two noise deviations"
+        divisor, unit = 2.0 * sensors.deviation, "two noise deviations"
+        if self.level is not None:  # exact readings
+            divisor, unit = self.scale[: sensors.count, None, None], "the state's root mean square"
+        moved = f"new minus last delivered measurement, over {unit}"
         blocks = [
             new("whitened_innovation", "innovation over its predicted deviation", _whitened),
             new("censored", at_threshold, lambda s: sensors.censored(s.measurement), limit=None),
             new(
                 "held_difference",
                 moved,
-                lambda s: (s.measurement - s.held) / (2.0 * sensors.deviation),
-                constants={"two noise deviations": 2.0 * sensors.deviation[..., 0]},
+                lambda s: (s.measurement - s.held) / divisor,
+                constants={unit: divisor[..., 0]},
             ),
             own(
                 "uncensored_probability",
@@ -246,40 +285,62 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
 
     def start(self, measurement: Array, announcement: Any) -> CensoredEstimate:
         """Return the estimate of the announced mean (n, N)."""
-        (n, runs), sensors, xp = announcement.shape, self.centre.sensors, namespace(announcement)
+        mean, day = announcement, None
+        if isinstance(announcement, Announcement):
+            mean, day = announcement
+        (n, runs), sensors, xp = mean.shape, self.centre.sensors, namespace(mean)
         covariance = xp.array(np.broadcast_to(self.model.initial_covariance, (n, n, runs)))
         first = CensoredEstimate(
             measurement=measurement,
             held=measurement,
             age=np.zeros((sensors.count, runs)),
             time=np.zeros(runs),
-            prior_mean=announcement,
+            prior_mean=mean,
             prior_covariance=covariance,
             prediction=None,
-            mean=announcement,
+            mean=mean,
             covariance=covariance,
+            day=day,
         )
         if not self.known_start:
             return first
-        prediction = self.centre.predict(announcement, covariance, measurement, first.time)
+        if self.level is not None:
+            filled = np.nan_to_num(measurement)
+            first.prediction = self.centre.predict(mean, covariance, filled, first.time)
+            first = self.observe(first, measurement)
+            first.held = first.measurement
+        prediction = self.centre.predict(mean, covariance, first.held, first.time)
         everyone = xp.ones((sensors.count, runs), dtype=np.bool_)
         result = self.update(replace(first, prediction=prediction), Reception(everyone))
-        return replace(result, prediction=None)
+        return replace(result, prediction=None, age=first.age)
 
     def predict(self, state: CensoredEstimate) -> CensoredEstimate:
-        """Predict at centre and nodes.
+        """Predict at centre and nodes; held readings stay while the level moves.
 
         Source: tobit_token_bucket, equations (21), (23), (29).
         """
+        time, held = state.time + 1.0, state.held
+        if self.level is not None:
+            held = held - (self._level(state, time) - self._level(state, state.time))
+            state = replace(state, held=held)
         (prior_mean, prior_covariance), prediction = self.centre.advance(self.model, state)
         return replace(
             state,
             age=state.age + 1.0,
-            time=state.time + 1.0,
+            time=time,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
             prediction=prediction,
         )
+
+    def observe(self, state: CensoredEstimate, measurement: Array) -> CensoredEstimate:
+        """See :class:`Estimator`; a sensor without a reading has the expectation."""
+        if self.level is None:
+            return super().observe(state, measurement)
+        available = np.isfinite(measurement[:, 0])
+        expected = sensed(state.prediction).expectation.value
+        filled = np.where(available[:, None], measurement, expected)
+        return replace(state, measurement=filled, available=available)
 
     def update(self, state: CensoredEstimate, reception: Reception) -> CensoredEstimate:
         """Update nodes and centre with the measurements that arrive.
@@ -290,6 +351,8 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         if self.reads_silence:
             prediction = prediction._replace(possible=reception.possible)
         arrived, xp = reception.arrived, namespace(reception.arrived)
+        if state.available is not None:
+            arrived = arrived & state.available
         mean, covariance = self.centre.update(prior, prediction, state.measurement, arrived)
         return replace(
             state,
@@ -305,7 +368,11 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         if not self.centre.separable:
             return None
         prior = state.prior_mean, state.prior_covariance
-        return self.centre.single(prior, sensed(state.prediction), state.measurement)
+        means, covariances = self.centre.single(prior, sensed(state.prediction), state.measurement)
+        if state.available is not None:
+            silent = self.update(state, Reception(np.zeros_like(state.available))).covariance
+            covariances = np.where(state.available[:, None, None], covariances, silent)
+        return means, covariances
 
     def read(self, state: CensoredEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
@@ -316,7 +383,7 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
             prior = state.prior_mean, state.prior_covariance
             return self.centre.variances(prior, sensed(state.prediction), self.state_weights)
 
-        return {
+        values = {
             **super().read(state, failure),
             "innovation": lambda: state.measurement - expectation.value,
             "censored": lambda: self.centre.sensors.censored(state.measurement),
@@ -326,6 +393,19 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
             "silent_variance": lambda: variances()[0],
             "variance_reduction": lambda: variances()[1],
         }
+        if self.level is None:
+            return values
+        level, available = self._level(state, state.time), cast(Any, state.available)
+        for name in ("measurement", "held", "expected_measurement"):
+            values[name] = np.asarray(values[name]) + level
+        values["sampled"] = available
+        values["variance_reduction"] = lambda: np.where(available, variances()[1], 0.0)
+        return values
+
+    def _level(self, state: CensoredEstimate, time: Array) -> Array:
+        level: Any = self.level
+        result: Array = level.at(state.day, time)
+        return result
 
     def _log_variance(self, state: CensoredEstimate) -> Array:
         variances = (linalg.diagonal(state.prior_covariance), self.reference[:, None])
