@@ -15,9 +15,16 @@ def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
 
     Args:
         state: Dataclasses, dictionaries and tuples of arrays (…, N), or functions that return them.
+            Arrays (…, 1) are equal in all runs.
         runs: Numbers of the runs.
     """
-    return _mapped(lambda array: array.take(runs, axis=-1), state)
+
+    def taken(array: NDArray[Any]) -> NDArray[Any]:
+        if array.shape[-1] == 1:
+            return array.repeat(len(runs), axis=-1)
+        return array.take(runs, axis=-1)
+
+    return _mapped(taken, state)
 
 
 def merge_runs(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:

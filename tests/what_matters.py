@@ -47,7 +47,9 @@ class Believed:
         """All that a policy may ask of beliefs."""
         values = {name: getattr(beliefs, name) for name in cls.parts}
         made_of = {
-            name: getattr(beliefs, name) for name in cls.states if beliefs.task.memory_estimator
+            name: getattr(beliefs, name)
+            for name in cls.states
+            if beliefs.task.memory_estimator and hasattr(beliefs, name)
         }
         return cls(values, made_of)
 

@@ -152,7 +152,7 @@ class EpisodeBatch(Runs):
         start, announcement = start_of(task, noise)
         state = advance(task, start, row, self.steps[runs])
         first, measurement = (task.plant.measurement(part.plant) for part in (start, state))
-        self.memory.begin(first, announcement, measurement, runs, self.num_envs)
+        self.memory.begin(first, announcement, measurement, runs, keys, self.num_envs)
         if self.reference is not None and not self._shared:
             beside = self.reference.predict(self.reference.start(first, announcement))
             beside = self.reference.observe(beside, measurement)
@@ -216,7 +216,7 @@ class EpisodeBatch(Runs):
         """Return the state of all runs for :meth:`restore`, valid until the next step."""
         fixed = ("task", "layout", "memory", "reference", "source", "network_source", "_program")
         moving = {key: value for key, value in vars(self).items() if key not in fixed}
-        return moving | {"memory_states": self.memory.states}
+        return moving | {"memory_states": self.memory.whole(self.num_envs)}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Set all runs to a :meth:`snapshot` of a batch of the same task."""
@@ -230,7 +230,7 @@ class EpisodeBatch(Runs):
     def _compiled(self) -> CompiledStep:
         from fusion_gym.core.compiled import CompiledStep
 
-        if self.memory.estimators:
+        if self.memory.parts:
             raise refusal("backend", "jax", "'numpy' with memory or the beliefs of local sensors")
         return CompiledStep(self.task, Memory(self.task, self.memory.owner), self.layout)
 
@@ -267,7 +267,7 @@ class EpisodeBatch(Runs):
     def _refer(self, estimator: Estimator[Any]) -> None:
         """Update the reference with every measurement of this step."""
         if self._shared:
-            beside = self.memory.states["every"]
+            beside = self.memory.whole(self.num_envs)["every"]
         else:
             everyone = np.ones((self.task.sensors, self.num_envs), dtype=np.bool_)
             self._full_state = beside = estimator.update(self._full_state, Reception(everyone))

@@ -18,28 +18,83 @@ Automatic Control 67, 2022, for its value.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.arrays import Array, take_runs
+from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import covariance_intersection
+
+if TYPE_CHECKING:
+    from fusion_gym.core.memory import Memory
 
 Owner = Literal["scheduler", "own"]
 Packets = NDArray[np.bool_]
 
 
-# States of N runs after sensing: "every" (N runs) of an estimator with all measurements, "own"
-# (sensors · N runs, a sensor's runs adjacent) with one sensor's measurements and received packets,
-# and "single", in the order of "own", of a centre with deliveries from that sensor only.
+class MemoryPart(NamedTuple):
+    """An estimator of the memory of N runs.
+
+    Its state has ``copies`` · N columns, a sensor's runs adjacent. A ``private`` state has no
+    packets of others. ``sensor`` is the only one that the estimator has; ``None`` is all.
+    """
+
+    estimator: Estimator[Any]
+    copies: int
+    private: bool
+    sensor: int | None = None
+
+    @property
+    def shared(self) -> bool:
+        """Whether runs with the same noise have the same state."""
+        return self.private and not self.estimator.reads_silence
+
+    def rows(self, values: Any) -> Any:
+        """Return the estimator's sensors among values (sensors, …)."""
+        return values if self.sensor is None else values[self.sensor : self.sensor + 1]
+
+    def itself(self, state: Any) -> Packets:
+        """Return the packets of the owner's own measurements, with one column if all are equal."""
+        sensors, columns = len(state.measurement), state.measurement.shape[-1]
+        if self.copies > 1:
+            eye = np.eye(sensors, dtype=np.bool_)
+            return np.repeat(eye, columns // self.copies, axis=-1)
+        for field in self.estimator.covariance_fields[:1]:
+            columns = getattr(state, field).shape[-1]
+        return np.ones((sensors, columns), dtype=np.bool_)
+
+    def places(self, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:
+        """Return the columns (copies · R,) of the runs (R,) in a state of ``num_envs`` runs."""
+        return (np.arange(self.copies)[:, None] * num_envs + runs).ravel()
+
+
+# States after sensing: "every" of an estimator with all measurements, "own" with one sensor's
+# measurements and received packets, and "single" of a centre with deliveries from that sensor only.
 MemoryStates = dict[str, Any]
+
+
+def whole_states(
+    parts: Mapping[str, MemoryPart],
+    states: MemoryStates,
+    places: NDArray[np.int64] | None,
+    num_envs: int,
+) -> MemoryStates:
+    """Return states with a column for each run."""
+    result = dict(states)
+    for name, state in states.items():
+        part = parts[name]
+        if part.shared and (places is not None or part.estimator.covariance_fields):
+            columns = np.arange(num_envs) if places is None else places
+            width = state.measurement.shape[-1] // part.copies
+            result[name] = take_runs(state, part.places(columns, width))
+    return result
 
 
 @dataclass(frozen=True)
@@ -73,7 +128,7 @@ class Beliefs(ABC):
     Args:
         task: The task.
         estimate: The estimator's state after observing.
-        memory_states: The memory states.
+        memory: The owner's memory.
         arrival: Probability (sensors, N) that a packet sent now arrives; ``None`` is 1.
         best: x*, if it is known.
     """
@@ -82,14 +137,15 @@ class Beliefs(ABC):
         self,
         task: Task,
         estimate: Any,
-        memory_states: MemoryStates,
+        memory: Memory,
         arrival: Array | None,
         best: Estimate | None = None,
     ) -> None:
         if best is not None:
             vars(self)["best"] = best
-        self.task, self.memory_states, self.arrival = task, memory_states, arrival
+        self.task, self.arrival = task, arrival
         self._estimate, self._runs = estimate, estimate.measurement.shape[-1]
+        self._parts, self._states, self._places = memory.parts, memory.states, memory.places
 
     @property
     @abstractmethod
@@ -106,10 +162,19 @@ class Beliefs(ABC):
     def best(self) -> Estimate:
         """x*, the estimate with all knowledge of the owner."""
 
-    @property
-    @abstractmethod
-    def memory_posterior(self) -> Any:
-        """Memory state after the update with the owner's new measurements."""
+    @cached_property
+    def posteriors(self) -> MemoryStates:
+        """Memory states of x* after the update with the owner's new measurements."""
+        return {
+            name: self.update(self._parts[name].estimator, state, self._parts[name].itself(state))
+            for name, state in self._states.items()
+            if not name.startswith("single")
+        }
+
+    @cached_property
+    def memory_states(self) -> MemoryStates:
+        """Memory states with a column for each run."""
+        return whole_states(self._parts, self._states, self._places, self._runs)
 
     def update(self, estimator: Estimator[Any], state: Any, packets: Packets) -> Any:
         """Return the state after the arrival of these packets (sensors, …) and no others."""
@@ -117,6 +182,30 @@ class Beliefs(ABC):
         if estimator.reads_silence and self.arrival is not None:
             failure = np.tile(1.0 - self.arrival, packets.shape[-1] // self._runs)
         return estimator.update(state, Reception(packets, failure=failure))
+
+    def _of_parts(self, kind: str, updated: MemoryStates) -> Estimate:
+        """Return the estimates of the parts of one kind, one after another."""
+        parts = ((name, part) for name, part in self._parts.items() if name.startswith(kind))
+        each = [self._of_part(part, updated[name]) for name, part in parts]
+        if len(each) == 1:
+            return each[0]
+        return Estimate(
+            np.concatenate([estimate.mean for estimate in each]),
+            lambda: np.concatenate([estimate.covariance for estimate in each]),
+        )
+
+    def _of_part(self, part: MemoryPart, updated: Any) -> Estimate:
+        """Return an estimate per copy of a part."""
+
+        def whole(values: Array) -> Array:
+            apart = np.moveaxis(values.reshape(*values.shape[:-1], part.copies, -1), -2, 0)
+            if part.shared and self._places is not None and apart.shape[-1] > 1:
+                apart = apart[..., self._places]
+            return np.broadcast_to(apart, (*apart.shape[:-1], self._runs))
+
+        estimator = part.estimator
+        mean = whole(estimator.mean(updated))
+        return Estimate(mean, lambda: whole(estimator.covariance(updated)))
 
     @cached_property
     def difference(self) -> Array:
@@ -166,16 +255,17 @@ class SchedulerBeliefs(Beliefs):
     @cached_property
     def best(self) -> Estimate:
         """x*, the estimate with all knowledge of the scheduler."""
-        return _fused(self.task.memory_estimator or self.task.estimator, self.memory_posterior)
-
-    @cached_property
-    def memory_posterior(self) -> Any:
-        """Memory state after the update; without memory the centre's state after all packets."""
+        if "every" in self._states:
+            return self._of_parts("every", self.posteriors)
         everyone = ~self._no_packets(self._runs)
-        if "every" not in self.memory_states:
-            return self.update(self.task.estimator, self._estimate, everyone)
-        assert self.task.memory_estimator is not None
-        return self.update(self.task.memory_estimator, self.memory_states["every"], everyone)
+        return _fused(
+            self.task.estimator, self.update(self.task.estimator, self._estimate, everyone)
+        )
+
+    @property
+    def memory_posterior(self) -> Any:
+        """Memory state after the update, with a column for each run."""
+        return whole_states(self._parts, self.posteriors, self._places, self._runs)["every"]
 
     @cached_property
     def _silent(self) -> Any:
@@ -200,9 +290,7 @@ class OwnBeliefs(Beliefs):
         """x̂, the centre's estimate without a transmission, as each sensor knows it."""
         estimator, sensors = self.task.estimator, self.task.sensors
         if self.task.broadcast == "none":
-            silence = self._no_packets(sensors * self._runs)
-            single = self.memory_states["single"]
-            return self._each(estimator, self.update(estimator, single, silence))
+            return self._single(sent=False)
         silence = self._no_packets(self._runs)
         received = _fused(estimator, self.update(estimator, self._estimate, silence))
         return Estimate(
@@ -213,46 +301,54 @@ class OwnBeliefs(Beliefs):
     @cached_property
     def sent(self) -> Estimate:
         """x̂(s), the centre's estimate if only the packet of s arrives, as sensor s knows it."""
-        estimator, state = self.task.estimator, self.memory_states.get("single")
-        if state is None:
-            single = estimator.single_deliveries(self._estimate)
-            if single is not None:
-                return Estimate(*single)
-            every = np.tile(np.arange(self._runs), self.task.sensors)
-            state = take_runs(self._estimate, every)
-        own = self._each(estimator, self.update(estimator, state, self._itself))
-        alone = "single" not in self.memory_states or self.task.broadcast == "none"
-        return own if alone else _joined(self.silent, own)
+        estimator, sensors = self.task.estimator, self.task.sensors
+        if any(name.startswith("single") for name in self._parts):
+            own = self._single(sent=True)
+            return own if self.task.broadcast == "none" else _joined(self.silent, own)
+        single = estimator.single_deliveries(self._estimate)
+        if single is not None:
+            return Estimate(*single)
+        part = MemoryPart(estimator, sensors, private=False)
+        state = take_runs(self._estimate, np.tile(np.arange(self._runs), sensors))
+        return self._of_part(part, self.update(estimator, state, part.itself(state)))
 
     @cached_property
     def best(self) -> Estimate:
         """x*, the estimate with all knowledge of each sensor."""
         if self.task.memory_estimator is None:
             return self.sent
-        own = self._each(self.task.memory_estimator, self.memory_posterior)
+        own = self._of_parts("own", self.posteriors)
         if self.task.broadcast != "estimate":
             return own
         return _joined(self.sent if self.task.feedback else self.silent, own)
 
+    def _single(self, sent: bool) -> Estimate:
+        """Return the estimates of the centre after each sensor's own packet, or none."""
+        updated = {}
+        for name, part in self._parts.items():
+            if name.startswith("single"):
+                packets = part.itself(self._states[name]) & sent
+                updated[name] = self.update(part.estimator, self._states[name], packets)
+        self._known[sent] = updated
+        return self._of_parts("single", updated)
+
+    def delivered(self, arrived: Packets, name: str) -> Any:
+        """Return the state of a part "single" after packets (sensors, N)."""
+        part, state = self._parts[name], self._states[name]
+        packets = part.rows(np.tile(arrived, part.copies)) & part.itself(state)
+        if len(self._known) < 2 or part.estimator.reads_silence:
+            return self.update(part.estimator, state, packets)
+        runs = np.flatnonzero(packets.any(0))
+        return _merged(self._known[False][name], self._known[True][name], runs)
+
     @cached_property
-    def memory_posterior(self) -> Any:
-        """Memory states after the update with each sensor's own measurement."""
-        assert self.task.memory_estimator is not None
-        return self.update(self.task.memory_estimator, self.memory_states["own"], self._itself)
+    def _known(self) -> dict[bool, MemoryStates]:
+        return {}
 
-    @property
-    def _itself(self) -> Packets:
-        """Each sensor's packet in its own runs (sensors, sensors · N)."""
-        return np.repeat(np.eye(self.task.sensors, dtype=np.bool_), self._runs, axis=-1)
 
-    def _each(self, estimator: Estimator[Any], updated: Any) -> Estimate:
-        """Return one estimate per sensor from sensors · N runs."""
-        shape, whole = (self.task.sensors, self._runs), _fused(estimator, updated)
-
-        def apart(values: Array) -> Array:
-            return np.moveaxis(values.reshape(*values.shape[:-1], *shape), -2, 0)
-
-        return Estimate(apart(whole.mean[0]), lambda: apart(whole.covariance[0]))
+def _merged(state: Any, other: Any, runs: NDArray[np.int64]) -> Any:
+    """Return a state with the columns ``runs`` of another one."""
+    return merge_runs(state, take_runs(other, runs), runs) if runs.size else state
 
 
 def _fused(estimator: Estimator[Any], updated: Any) -> Estimate:

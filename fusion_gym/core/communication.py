@@ -51,7 +51,7 @@ def _check_estimates(scenario: Scenario, has_memory: bool) -> None:
     reason = scenario.no_estimates
     if not has_memory:
         reason = "an estimate needs memory=True"
-    elif not scenario.estimator.adopts:
+    elif type(scenario.estimator).adopt is Estimator.adopt:
         reason = reason or "this system's centre cannot continue from a delivered estimate"
     if reason is not None:
         raise validation.refusal("packet", "estimate", f"'measurement', because {reason}", "here")

@@ -51,6 +51,8 @@ class Estimator(ABC, Generic[StateT]):
         numpy_only: Name of the option that needs ``backend="numpy"``, ``None`` if JAX runs the
             estimator.
         reads_silence: Whether :meth:`update` uses ``possible`` and ``failure``.
+        covariance_fields: Fields of a state that depend only on the receptions; they have one
+            column for all runs while the receptions (l, 1) are equal.
         covariance_cycle: Period, in steps, of a covariance recursion that depends only on the
             receptions; ``None`` if it depends on the measurements.
 
@@ -70,6 +72,7 @@ class Estimator(ABC, Generic[StateT]):
     signals: tuple[Signal, ...]
     numpy_only: str | None = "system"
     reads_silence: bool = False
+    covariance_fields: tuple[str, ...] = ()
     covariance_cycle: int | None = None
 
     @property
@@ -155,11 +158,6 @@ class Estimator(ABC, Generic[StateT]):
         names = (signal.name for signal in self.signals)
         return {name: getattr(state, name) for name in names if hasattr(state, name)}
 
-    @property
-    def adopts(self) -> bool:
-        """Whether the class has :meth:`adopt`."""
-        return type(self).adopt is not Estimator.adopt
-
     def adopt(self, state: StateT, mean: Array, covariance: Array, runs: NDArray[Any]) -> StateT:
         """Return a state whose fusion centre has another estimate in some runs.
 
@@ -180,5 +178,17 @@ class Estimator(ABC, Generic[StateT]):
         Returns:
             Means (l, n, N) and covariances (l, n, n, N), of which entry i has sensor i's packet
             only; ``None`` where one update per sensor is as fast.
+        """
+        return None
+
+    def select_sensor(self, sensor: int) -> Estimator[StateT] | None:
+        """Return an estimator of one sensor alone.
+
+        Args:
+            sensor: Number of the sensor.
+
+        Returns:
+            An estimator with the same fused estimates while no other sensor transmits; ``None``
+            where there is none that is faster.
         """
         return None

@@ -12,8 +12,9 @@ scheduler has all measurements. A local sensor has its own measurements and the 
 """
 
 import copy
-from collections.abc import Callable, Mapping
-from typing import Any, Self, get_args
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Self, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +24,13 @@ from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.beliefs import (
     Beliefs,
     Estimate,
+    MemoryPart,
     MemoryStates,
     OwnBeliefs,
     Owner,
     SchedulerBeliefs,
+    whole_states,
 )
-from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
@@ -41,9 +43,13 @@ class Memory:
         task: The task.
         owner: ``"scheduler"``, or ``"own"`` for every local sensor.
 
+    A state that no transmission changes has one column for all runs with the same noise, and the
+    ``covariance_fields`` of its estimator have one column for all runs that begin together.
+
     Attributes:
-        estimators: Estimators of the memory states, by name.
-        states: Memory states after sensing, by name.
+        parts: Parts of the memory, by name.
+        states: Their states after sensing, by name.
+        places: Columns (N,) of the runs in the private parts' states; ``None`` is one per run.
 
     Raises:
         ConfigurationError: The owner is local, and packets hold the scheduler's estimate or may be
@@ -59,16 +65,30 @@ class Memory:
             raise refusal("packet", task.packet, f"'measurement' {why}")
         if own and len(task.network.delay) > 1:
             raise refusal("delay", task.network.delay, "none with the memory of local sensors")
-        self.estimators: dict[str, Estimator[Any]] = {}
+        self.parts: dict[str, MemoryPart] = {}
         if task.memory_estimator is not None:
-            self.estimators["own" if own else "every"] = task.memory_estimator
+            if own:
+                self._add("own", task.memory_estimator, private=task.broadcast != "packets")
+            else:
+                self.parts["every"] = MemoryPart(task.memory_estimator, copies=1, private=True)
         if own and (
             task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
         ):
-            self.estimators["single"] = task.estimator
-        self.keeps_every = "every" in self.estimators
+            self._add("single", task.estimator, private=False)
+        self.keeps_every = "every" in self.parts
         self.states: MemoryStates = {}
+        self.places: NDArray[np.int64] | None = None
+        self._first: NDArray[np.int64] | None = None  # a run of each column
         self._beliefs: Beliefs | None = None
+
+    def _add(self, name: str, estimator: Any, private: bool) -> None:
+        """Add a part for each sensor where the estimator allows it, else one with copies."""
+        alone = [estimator.select_sensor(i) for i in range(self.task.sensors)]
+        if (private or name == "single") and None not in alone:
+            for sensor, own in enumerate(alone):
+                self.parts[f"{name} {sensor}"] = MemoryPart(own, 1, private, sensor)
+        else:
+            self.parts[name] = MemoryPart(estimator, self.task.sensors, private)
 
     def begin(
         self,
@@ -76,6 +96,7 @@ class Memory:
         announcement: Any,
         measurement: Array,
         runs: NDArray[np.int64],
+        keys: Sequence[Any],
         num_envs: int,
     ) -> None:
         """Start in the R runs ``runs``, and observe.
@@ -85,17 +106,32 @@ class Memory:
             announcement: The plant's announcement of the start.
             measurement: Measurements (sensors, m, R) of the first sensing.
             runs: Numbers of the runs (R,).
+            keys: Keys of the runs' noise (R,).
             num_envs: Number of all runs.
         """
-        fresh, every = {}, np.arange(len(runs))
-        for name, estimator in self.estimators.items():
-            start = estimator.start(first, announcement)
-            fresh[name] = take_runs(start, np.tile(every, self._copies(name)))
-        new, old = self._observed(fresh, measurement), self.states
-        if len(runs) < num_envs:
-            for name, state in new.items():
-                new[name] = merge_runs(old[name], state, self._places(name, runs, num_envs))
-        self.states, self._beliefs = new, None
+        together, old = len(runs) == num_envs, self.whole(num_envs)
+        self.places = self._first = self._beliefs = None
+        if together and len(column := {key: place for place, key in enumerate(keys)}) < num_envs:
+            self._first = np.sort(list(column.values()))
+            self.places = np.searchsorted(self._first, [column[key] for key in keys])
+        self.states = {}
+        for name, part in self.parts.items():
+            start = part.estimator.start(part.rows(first), announcement)
+            columns = np.arange(len(runs))
+            if part.shared and self._first is not None:
+                columns = self._first
+            state = take_runs(start, np.tile(columns, part.copies))
+            if together and part.shared and part.copies == 1:
+                fields = part.estimator.covariance_fields
+                first_run = np.zeros(1, dtype=np.int64)
+                values = {field: take_runs(getattr(state, field), first_run) for field in fields}
+                state = replace(state, **values)
+            self.states[name] = state
+        self.observe(measurement)
+        if not together:
+            for name, state in self.states.items():
+                places = self.parts[name].places(runs, num_envs)
+                self.states[name] = merge_runs(old[name], state, places)
 
     def beliefs(self, estimate: Any, arrival: Array | None) -> Beliefs:
         """Return the owner's beliefs before any transmission.
@@ -120,27 +156,40 @@ class Memory:
 
     def observe(self, measurement: Array) -> None:
         """Predict, and take the new measurements (sensors, m, N)."""
-        self.states, self._beliefs = self._observed(self.states, measurement), None
+        states, self._beliefs = {}, None
+        for name, state in self.states.items():
+            part, own = self.parts[name], self.parts[name].rows(measurement)
+            if part.shared and self._first is not None:
+                own = own[..., self._first]
+            if part.copies > 1:
+                own = np.tile(own, part.copies)
+            states[name] = part.estimator.observe(part.estimator.predict(state), own)
+        self.states = states
 
     def forget(self) -> None:
         """Forget the beliefs of the step before."""
         self._beliefs = None
 
+    def whole(self, num_envs: int) -> MemoryStates:
+        """Return the states with a column for each of the ``num_envs`` runs."""
+        return whole_states(self.parts, self.states, self.places, num_envs)
+
     def branch(self, runs: NDArray[np.int64] | None, num_envs: int) -> Self:
         """Return an independent memory of ``runs`` of the ``num_envs`` runs, by default of all."""
-        result = copy.copy(self)
-        if runs is not None:
-            result._beliefs = None
-            result.states = {
-                name: take_runs(state, self._places(name, runs, num_envs))
-                for name, state in self.states.items()
+        if runs is None:
+            return copy.copy(self)
+        return self.with_states(
+            {
+                name: take_runs(state, self.parts[name].places(runs, num_envs))
+                for name, state in self.whole(num_envs).items()
             }
-        return result
+        )
 
     def with_states(self, states: MemoryStates) -> Self:
-        """Return a memory of other runs with these states."""
+        """Return a memory of other runs with these states, a column for each run."""
         result = copy.copy(self)
-        result.states, result._beliefs = states, None
+        result.states = states
+        result.places = result._first = result._beliefs = None
         return result
 
     def with_best(self, estimate: Any, arrival: Array | None, best: Estimate) -> Self:
@@ -162,35 +211,18 @@ class Memory:
         self, estimate: Any, arrival: Array | None, best: Estimate | None = None
     ) -> Beliefs:
         kind = OwnBeliefs if self.owner == "own" else SchedulerBeliefs
-        return kind(self.task, estimate, self.states, arrival, best)
-
-    def _observed(self, states: MemoryStates, measurement: Array) -> MemoryStates:
-        """Return the states after their own measurements (sensors, m, N)."""
-        result = {}
-        for name, state in states.items():
-            estimator, copies = self.estimators[name], self._copies(name)
-            own = np.tile(measurement, copies) if copies > 1 else measurement
-            result[name] = estimator.observe(estimator.predict(state), own)
-        return result
+        return kind(self.task, estimate, self, arrival, best)
 
     def _updated(self, beliefs: Beliefs, arrived: NDArray[np.bool_]) -> MemoryStates:
-        # Each sensor's own packet in its own runs (sensors, sensors · N).
-        itself = np.repeat(np.eye(self.task.sensors, dtype=np.bool_), arrived.shape[-1], axis=-1)
-        result = {}
-        for name, state in self.states.items():
-            if name == "single":
-                packets = np.tile(arrived, self.task.sensors) & itself
-            elif name == "own" and self.task.broadcast == "packets":
-                packets = np.tile(arrived, self.task.sensors) | itself
-            else:
-                result[name] = beliefs.memory_posterior
+        result, own = {}, cast(OwnBeliefs, beliefs)
+        for name, part in self.parts.items():
+            state = self.states[name]
+            if part.private:
+                result[name] = beliefs.posteriors[name]
                 continue
-            result[name] = beliefs.update(self.estimators[name], state, packets)
+            if name.startswith("single"):
+                result[name] = own.delivered(arrived, name)
+                continue
+            packets = np.tile(arrived, part.copies) | part.itself(state)
+            result[name] = beliefs.update(part.estimator, state, packets)
         return result
-
-    def _copies(self, name: str) -> int:
-        return 1 if name == "every" else self.task.sensors
-
-    def _places(self, name: str, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:
-        """Return the positions (copies · R,) of the runs (R,) in a memory state."""
-        return (np.arange(self._copies(name))[:, None] * num_envs + runs).ravel()

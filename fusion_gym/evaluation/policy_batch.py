@@ -72,10 +72,10 @@ class _Part(Beliefs):
     """The beliefs of some runs."""
 
     silent, sent, best = _of_runs("silent"), _of_runs("sent"), _of_runs("best")
-    memory_posterior = _of_runs("memory_posterior")
+    memory_posterior, memory_states = _of_runs("memory_posterior"), _of_runs("memory_states")
     loss, value = _of_runs("loss"), _of_runs("value")
 
     def __init__(self, whole: Beliefs, runs: Runs) -> None:
-        self.task, self.memory_states = whole.task, whole.memory_states
+        self.task = whole.task
         self.arrival = take_runs(whole.arrival, runs)
         self._whole, self._choices = whole, runs

@@ -406,11 +406,11 @@ class SequentialIntersection(SmallestTrace):
         """Return the fused active estimates."""
         own = own_covariances(covariance)
         basis = self.metric(own, basis)
-        count, _, runs = means.shape
+        count = len(means)
         self._check_order(count)
-        selected = np.ones((count, runs), dtype=np.bool_) if active is None else active
+        selected = np.ones((count, own.shape[-1]), dtype=np.bool_) if active is None else active
         mean, fused = np.full(means.shape[1:], np.nan), np.full(own.shape[1:], np.nan)
-        begun = np.zeros(runs, dtype=np.bool_)
+        begun = np.zeros(selected.shape[-1], dtype=np.bool_)
         steps: list[_Step] = []
         for estimate in range(count) if self.order is None else self.order:
             if not selected[estimate].any():

@@ -1,7 +1,7 @@
 """The planning model of a reference policy: the task's model without hidden quantities."""
 
 from itertools import product
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,10 +73,10 @@ class PlanningModel:
 
     def best_means(self, steps: int) -> Array:
         """Return the predicted means (steps, n, N) of the best estimate, from all measurements."""
-        estimator = self._task.memory_estimator
-        if estimator is None or self._beliefs is None:
+        estimator, beliefs = self._task.memory_estimator, cast(Any, self._beliefs)
+        if estimator is None or beliefs is None:
             return self.fused_means(np.ones((self._task.sensors, self.runs), np.bool_), steps)
-        return self._silent_path(estimator, self._beliefs.memory_posterior, steps)
+        return self._silent_path(estimator, beliefs.memory_posterior, steps)
 
     def _silent_path(self, estimator: Estimator[Any], updated: Any, steps: int) -> Array:
         """Return fused means (steps, n, N) without measurements and transmissions."""

@@ -91,3 +91,9 @@ class CorrelatedSensors(Sensors):
         result += self.deviation * noise.reshape(self.count, self.size, noise.shape[-1])
         result += linalg.matvec(self.coupling, process_noise)
         return result
+
+    def select(self, sensor: int) -> CorrelatedSensors:
+        """Return one of the sensors alone."""
+        own = slice(sensor, sensor + 1)
+        parts = {name: value[own] for name, value in vars(self).items() if name != "covariance"}
+        return CorrelatedSensors(**parts, covariance=self.covariance[own, own])

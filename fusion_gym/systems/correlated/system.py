@@ -25,6 +25,7 @@ from fusion_gym.core.knowledge import (
     sensed,
 )
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
     JointErrorCovariance,
@@ -151,6 +152,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
     noise_scale: float
     joint: JointErrorCovariance | None = None
     signals = SIGNALS
+    covariance_fields = ("prior_covariance", "covariances", "joint")
     covariance_cycle = 1  # the recursion of the covariances does not depend on time
 
     @property
@@ -263,8 +265,24 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
             "prior_mean": state.prior_mean[0],
             "prior_covariance": state.prior_covariance[0],
             "silent_variance": lambda: self.trace(state.prior_covariance[0]),
-            "variance_reduction": lambda: self._variance_reduction(state, outcomes),
+            "variance_reduction": lambda: self._variance_reduction(state),
         }
+
+    def single_deliveries(self, state: CorrelatedTrackingEstimate) -> tuple[Array, Array]:
+        """See :class:`Estimator`; all sensors' runs are fused at once."""
+        outcomes, count = sensed(state.outcomes), len(state.age)
+        correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
+        means = state.prior_mean[1:] + correction, state.prior_mean[0]
+        covariances = outcomes.delivered_covariance, state.prior_covariance[0]
+        pairs = (
+            np.stack((np.tile(prior, count), np.concatenate(posterior, axis=-1)))
+            for posterior, prior in (means, covariances)
+        )
+        fused = self._pair.fuse(*pairs)
+        mean, covariance = (
+            np.stack(np.split(values, count, axis=-1)) for values in (fused.mean, fused.covariance)
+        )
+        return mean, covariance
 
     def adopt(
         self,
@@ -290,6 +308,11 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
     def local_means(self, state: CorrelatedTrackingEstimate) -> Array:
         """Return the nodes' posterior means (sensors, n, N)."""
         return state.means[1:]
+
+    def select_sensor(self, sensor: int) -> CorrelatedTrackingEstimator:
+        """See :class:`Estimator`; the centre joins its prediction with one node's estimate."""
+        own = RobustKalmanFilter(self.filter.sensors.select(sensor))
+        return replace(self, filter=own, fusion=self._pair, joint=None)
 
     def with_actual_covariance(self) -> CorrelatedTrackingEstimator:
         """Return the same estimator with tracked covariances of the errors."""
@@ -323,18 +346,16 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))
         return (state.measurement - self.filter.expect(state.prior_mean[0])) / deviation
 
-    def _variance_reduction(
-        self, state: CorrelatedTrackingEstimate, outcomes: RobustOutcomes
-    ) -> Array:
-        covariance = np.concatenate((state.prior_covariance[:1], outcomes.delivered_covariance))
-        silent = self.trace(covariance[0])
-        result = np.empty((self.filter.sensors.count, len(silent)))
-        for sensor in range(self.filter.sensors.count):
-            single = np.zeros(result.shape, dtype=np.bool_)
-            single[sensor] = True
-            fused = self.fusion.fuse(state.prior_mean, covariance, _with_prediction(single))
-            result[sensor] = silent - self.trace(fused.covariance)
-        return result
+    def _variance_reduction(self, state: CorrelatedTrackingEstimate) -> Array:
+        reduced = [self.trace(covariance) for covariance in self.single_deliveries(state)[1]]
+        return self.trace(state.prior_covariance[0]) - np.array(reduced)
+
+    @property
+    def _pair(self) -> FusionRule:
+        """The rule for the prediction and one node's estimate."""
+        if isinstance(self.fusion, SequentialIntersection):
+            return replace(self.fusion, order=None)
+        return self.fusion
 
 
 def _with_prediction(granted: NDArray[np.bool_]) -> NDArray[np.bool_]:
