@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 import joblib
 
 from agents.cache import Cache
+from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden
 from fusion_gym.output.ending import name_user_code
 from fusion_gym.output.folders import fingerprint
@@ -92,7 +93,7 @@ class WorkPiece(Protocol):
     """A piece of work: all inputs of its result, and its seconds on one core."""
 
     @property
-    def inputs(self) -> dict[str, Any]: ...  # noqa: D102
+    def inputs(self) -> Plain: ...  # noqa: D102
     @property
     def weight(self) -> float: ...  # noqa: D102
 

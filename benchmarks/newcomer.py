@@ -16,10 +16,10 @@ import subprocess
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from fusion_gym import __version__
 from fusion_gym.docstrings import table
+from fusion_gym.entries import Plain
 
 PAGE = Path(__file__).parent.parent / "docs" / "newcomer.md"
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -82,7 +82,7 @@ def points_table(path: Path) -> str:
     """Return the table of the agent and the best rule at each price."""
     rows = []
     for point in json.loads(path.read_text())["points"]:
-        comparison: dict[str, Any] = point["at_price"]
+        comparison: Plain = point["at_price"]
         cost, difference = comparison["cost"], comparison["difference"]
         ends = (f"{difference[end] / cost:+.1%}" for end in ("low", "high"))
         cells = f"{comparison['price']:.3g}", f"{point['rate']:.3f}", f"{point['mse']:.3g}"

@@ -23,6 +23,7 @@ from rich.table import Table
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.scale import sustained_tokens
+from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output import tables
 from fusion_gym.output.ending import report_errors
@@ -33,7 +34,7 @@ DRAWN = 3
 ENV = "fusion_gym/LinearFusion-v2"
 
 
-def draw_plant(seed: int) -> dict[str, Any]:
+def draw_plant(seed: int) -> Options:
     """Return the options of a random plant of two to four states with at least as many sensors."""
     generator = np.random.default_rng(seed)
     states, sensors = generator.integers([2, 3], [5, 6]).tolist()
@@ -53,7 +54,7 @@ def draw_plant(seed: int) -> dict[str, Any]:
     }
 
 
-PLANTS: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("plants.yaml").read_text())
+PLANTS: Options = yaml.safe_load(Path(__file__).with_name("plants.yaml").read_text())
 PLANTS |= {f"drawn_{seed}": draw_plant(seed) for seed in range(DRAWN)}
 
 
@@ -111,7 +112,7 @@ def judge(name: str, arguments: argparse.Namespace) -> Row:
     return Row(name, seconds, min(shares), max(shares), fmean(costs), min(costs), max(costs))
 
 
-def run_commands(options: dict[str, Any], folder: Path, arguments: argparse.Namespace) -> float:
+def run_commands(options: Options, folder: Path, arguments: argparse.Namespace) -> float:
     """Run the commands of the newcomer's page, and return their processor seconds."""
     folder.mkdir(parents=True, exist_ok=True)
     plant, front = folder / "plant.yaml", folder / "front"

@@ -23,6 +23,7 @@ from benchmarks.newcomer import replaced
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.docstrings import table
+from fusion_gym.entries import Options
 from fusion_gym.evaluation import run_episodes, summarise
 from fusion_gym.output.figures import save_figure
 from fusion_gym.output.files import write
@@ -30,7 +31,7 @@ from fusion_gym.output.files import write
 PAGE = Path(__file__).parent.parent / "docs" / "silence.md"
 RATES = 0.02, 0.05, 0.1, 0.2, 0.3
 _NEXT = np.roll(np.eye(6), 1, axis=1)
-PLANTS: dict[str, dict[str, Any]] = {
+PLANTS: dict[str, Options] = {
     "default": {},
     "ring": {  # six states that exchange heat with their neighbours
         "transition": (0.9 * np.eye(6) + 0.04 * (_NEXT + _NEXT.T)).tolist(),
@@ -45,12 +46,12 @@ PLANTS: dict[str, dict[str, Any]] = {
         "measurement_covariances": [0.02, 0.1, 0.02, 0.1, 0.02, 0.1],
     },
 }
-Method = Callable[[Array], tuple[dict[str, Any], str]]
+Method = Callable[[Array], tuple[Options, str]]
 
 
-def delta(thresholds: Array, kind: str) -> tuple[dict[str, Any], str]:
+def delta(thresholds: Array, kind: str) -> tuple[Options, str]:
     """Return the options of a filter, and send-on-delta with a threshold for each sensor."""
-    options: dict[str, Any] = {"filter": kind}
+    options: Options = {"filter": kind}
     if kind == "truncated":
         options |= {"trigger": "send_on_delta", "trigger_threshold": thresholds.tolist()}
     return options, f"send_on_delta:threshold={'/'.join(map(repr, thresholds.tolist()))}"
@@ -72,7 +73,7 @@ METHODS: dict[str, Method] = {
 }
 
 
-def changes(plant: dict[str, Any]) -> Array:
+def changes(plant: Options) -> Array:
     """Return the deviations (sensors,) of what the measurements change in ten steps."""
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", tokens="unlimited", **plant)
     batch = EpisodeBatch.seeded(task, 1000, 0)
@@ -83,7 +84,7 @@ def changes(plant: dict[str, Any]) -> Array:
     return result
 
 
-def run(plant: dict[str, Any], method: Method, scales: Array, episodes: int, seed: int) -> Any:
+def run(plant: Options, method: Method, scales: Array, episodes: int, seed: int) -> Any:
     """Return the metrics of a method."""
     options, rule = method(scales)
     options = {"tokens": "unlimited", "reward_scale": None} | plant | options
@@ -91,9 +92,7 @@ def run(plant: dict[str, Any], method: Method, scales: Array, episodes: int, see
     return summarise(run_episodes(task, fusion_gym.make_policy(rule, task), episodes, seed))
 
 
-def at_rate(
-    plant: dict[str, Any], method: Method, shape: Array, rate: float
-) -> tuple[Array, float]:
+def at_rate(plant: Options, method: Method, shape: Array, rate: float) -> tuple[Array, float]:
     """Return the scales of this shape at the rate, and their mean squared error."""
     low, high = np.log([0.02, 50.0])
     for _ in range(9):
@@ -106,7 +105,7 @@ def at_rate(
     return np.exp(middle) * shape, result["mse"]["mean"]
 
 
-def tune(plant: dict[str, Any], method: Method, shape: Array, rate: float) -> Array:
+def tune(plant: Options, method: Method, shape: Array, rate: float) -> Array:
     """Return one threshold a sensor, each changed by a factor while the error falls."""
     best, error = at_rate(plant, method, shape, rate)
     for sensor in range(len(shape)):

@@ -32,13 +32,14 @@ import fusion_gym
 import fusion_gym.jax
 from benchmarks.newcomer import replaced
 from fusion_gym.docstrings import table
+from fusion_gym.entries import Options
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 PAGE = Path(__file__).parent.parent / "docs" / "speed.md"
 LOOP = Path(__file__).with_name("oscillator.c")
 TURNS, RUNS = 5, (1, 64, 1024, 4096)
 RULE = "innovation_threshold:threshold=1.1"
-OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
+OPTIONS: tuple[tuple[str, Options], ...] = (
     ("TobitOscillator-v1", {}),
     ("TobitOscillator-v1", {"filter": "tobit"}),
     ("BiasedOscillator-v1", {"access": "any"}),
@@ -46,7 +47,7 @@ OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("LinearFusion-v2", {}),
     ("RemoteEstimation-v1", {}),
 )
-NUMPY_ONLY: tuple[tuple[str, dict[str, Any]], ...] = (
+NUMPY_ONLY: tuple[tuple[str, Options], ...] = (
     ("CorrelatedTracking-v1", {}),
     ("CorrelatedTracking-v1", {"fusion": "ci"}),
     ("MarkovJumpTracking-v1", {}),
@@ -72,7 +73,7 @@ def timed(step: Callable[[], object], steps_per_call: int) -> Workload:
     return run
 
 
-def interface(env_id: str, options: dict[str, Any], runs: int, backend: str) -> Workload:
+def interface(env_id: str, options: Options, runs: int, backend: str) -> Workload:
     """``gym.make`` for one run, else ``gym.make_vec``, with the reset of ended episodes."""
     if backend == "jax":
         options = options | {"backend": "jax"}
@@ -97,7 +98,7 @@ def _workload(env: Any, runs: int, step: Callable[[Any], object]) -> Workload:
     return timed(lambda: step(actions[next(count) % 16]), runs)
 
 
-def noise_given(env_id: str, options: dict[str, Any], runs: int) -> Workload:
+def noise_given(env_id: str, options: Options, runs: int) -> Workload:
     """The compiled step of the batch, whose noise is the same in every step."""
     env = gymnasium.make_vec(
         env_id, runs, vectorization_mode="vector_entry_point", backend="jax", **options
@@ -114,7 +115,7 @@ def noise_given(env_id: str, options: dict[str, Any], runs: int) -> Workload:
     return timed(step, runs)
 
 
-def scan(env_id: str, options: dict[str, Any], runs: int) -> Workload:
+def scan(env_id: str, options: Options, runs: int) -> Workload:
     """100 steps of pure functions under ``jax.lax.scan``, with a rule, noise and resets."""
     env, params = fusion_gym.jax.make(env_id, **options)
     rule = fusion_gym.make_policy(RULE, env.task)
@@ -137,7 +138,7 @@ def scan(env_id: str, options: dict[str, Any], runs: int) -> Workload:
     return timed(lambda: jax.block_until_ready(episodes(states, keys[0])), 100 * runs)
 
 
-def sb3(env_id: str, options: dict[str, Any], runs: int, native: bool = True) -> Workload:
+def sb3(env_id: str, options: Options, runs: int, native: bool = True) -> Workload:
     """The native environment of Stable-Baselines3, or its DummyVecEnv over ``gym.make``."""
     if native:
         env: VecEnv = fusion_gym.make_sb3_vec_env(env_id, runs, seed=0, stagger=True, **options)
@@ -202,7 +203,7 @@ def rows(folder: str) -> Iterator[tuple[str, str, dict[int, Workload]]]:
     device = jax.devices()[0].platform
     for name, options in OPTIONS:
         env_id, label = f"fusion_gym/{name}", _label(name, options)
-        kinds: dict[str, Callable[[str, dict[str, Any], int], Workload]] = {
+        kinds: dict[str, Callable[[str, Options, int], Workload]] = {
             "NumPy": partial(interface, backend="numpy"),
             f"JAX ({device})": partial(interface, backend="jax"),
             f"JAX ({device}), noise given": noise_given,
@@ -216,7 +217,7 @@ def rows(folder: str) -> Iterator[tuple[str, str, dict[int, Workload]]]:
         yield _label(name, options), "NumPy", {1024: interface(env_id, options, 1024, "numpy")}
 
 
-def _label(name: str, options: dict[str, Any]) -> str:
+def _label(name: str, options: Options) -> str:
     given = ", ".join(f"`{key}={value!r}`" for key, value in options.items())
     return f"{name}, {given}" if given else name
 

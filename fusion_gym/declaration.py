@@ -66,12 +66,25 @@ def type_text(hint: Any) -> str:
 _hints_of = functools.cache(hints)  # cached, because every options object is checked
 
 
+class Mark(functools.partial[Any]):
+    """A check in the type of a field, ``Annotated[int, Mark(integer, at_least=1)]``.
+
+    It takes the field's name and its value, or every entry of a tuple.
+    """
+
+
 def check(options: Any) -> None:
-    """Check the options that are declared as ``Literal``, ``bool`` or a name of a table."""
+    """Check what is declared as ``Literal``, ``bool``, a name of a table, or with a mark."""
     for name, hint in _hints_of(options.__class__).items():
         value, parts = getattr(options, name), _parts(hint)
-        table = hint.__metadata__[0] if get_origin(hint) is Annotated else {}
-        if (value is None and NoneType in parts) or not isinstance(table, Mapping):
+        marks = hint.__metadata__ if get_origin(hint) is Annotated else ({},)
+        if value is None and NoneType in parts:
+            continue
+        for mark in marks:
+            if isinstance(mark, Mark):
+                for entry in value if isinstance(value, tuple) else (value,):
+                    mark(name, entry)
+        if not isinstance(marks[0], Mapping):
             continue
         if allowed := choices(hint):
             validation.choice(name, value, allowed)

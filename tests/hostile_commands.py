@@ -16,7 +16,7 @@ from agents.papers.table import Table
 from agents.zoo.zoo import Zoo
 from fusion_gym.commands import __main__ as fusion_gym_commands
 from fusion_gym.commands.command_line import Command
-from fusion_gym.commands.options import OutputFile, OutputFolder
+from fusion_gym.commands.options import OUTPUT_FOLDER, OutputFile
 
 RESEARCH: dict[str, type[Command]] = {
     "benchmark": Benchmark,
@@ -135,12 +135,12 @@ def options(name: str) -> dict[str, Any]:
 
 def hostile(option: str, kind: Any, present: list[str] | None = None) -> list[str]:
     """Values that an option of this type cannot have; ``present`` is one that it has."""
-    marks = {type(mark) for mark in getattr(kind, "__metadata__", ())}
+    marks = getattr(kind, "__metadata__", ())
     text = str(kind)
     results = [f"bad_results/{name}" for name in JSON]
-    if OutputFolder in marks:
+    if OUTPUT_FOLDER in marks:
         values = [*FOLDERS, *(results if present == ["results"] else [])]
-    elif OutputFile in marks:
+    elif any(isinstance(mark, OutputFile) for mark in marks):
         values = FILES
     elif option in ("policies", "policy", "against"):
         values = POLICIES

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import yaml
+from benchmark_rows import read_rows
 from command_runs import refusal, succeed
 from scipy import stats
 
@@ -58,7 +59,7 @@ def test_from_prices_to_pages_and_zoo(
 ) -> None:
     printed = succeed("benchmark", small).out
     folder = tmp_path / "results"
-    policies = tables.read_rows(folder, tables.TestRow)
+    policies = read_rows(folder, tables.TestRow)
     for name in CLASSES:
         for kind, seeds in (("rule", 1), ("threshold", 1), ("agent", 2), ("learned", 2)):
             own = [row for row in policies if (row.name, row.kind) == (name, kind)]
@@ -69,13 +70,13 @@ def test_from_prices_to_pages_and_zoo(
                 assert row.cost == pytest.approx(row.error + row.price * row.tokens, rel=1e-4)
     for kind in ("optimum", "other", "other_learned"):
         assert {row.name for row in policies if row.kind == kind} == {"scheduler"}
-    means = tables.read_rows(folder, tables.ClassRow)
-    points = tables.read_rows(folder, tables.PointRow)
+    means = read_rows(folder, tables.ClassRow)
+    points = read_rows(folder, tables.PointRow)
     for mean in means:
         key = (mean.name, mean.kind)
         own_points = [point.difference for point in points if (point.name, point.kind) == key]
         assert mean.difference == pytest.approx(np.mean(own_points), abs=1e-4)
-    trainings = tables.read_rows(folder, tables.TrainingRow)
+    trainings = read_rows(folder, tables.TrainingRow)
     assert [row.algorithm for row in trainings] == ["counterfactual_ppo"] * 6 + ["ppo"] * 2
     for row in trainings:
         kind = "learned" if row.algorithm == "counterfactual_ppo" else "other_learned"
@@ -85,7 +86,7 @@ def test_from_prices_to_pages_and_zoo(
         assert row.learned == pytest.approx(ratios.mean() - 1.0, abs=1e-4)
         # Where the calibration takes the rule alone, both policies are the same.
         assert 0 <= row.rule_points <= np.isclose(ratios, 1.0, atol=1e-5).sum()
-    savings = {row.kind: row for row in tables.read_rows(folder, tables.SavingRow)}
+    savings = {row.kind: row for row in read_rows(folder, tables.SavingRow)}
     costs = {
         (kind, name): np.array([p.cost for p in policies if (p.kind, p.name) == (kind, name)])
         for kind in ("rule", "trigger")
@@ -94,7 +95,7 @@ def test_from_prices_to_pages_and_zoo(
     shares = [1.0 - costs["rule", name] / costs["trigger", name] for name in ("local", "scheduler")]
     assert savings["rule"].saving == pytest.approx(np.mean(shares), abs=1e-4)
     assert savings["rule"].classes == 2
-    cases = tables.read_rows(folder, tables.CaseRow)
+    cases = read_rows(folder, tables.CaseRow)
     assert [row.case for row in cases] == ["as assumed", "half the tokens"]
     assert cases[0].rule == 0.0
     page = (folder / "README.md").read_text()

@@ -13,6 +13,7 @@ from stable_baselines3 import DQN, PPO
 from training_configs import small_config
 
 import fusion_gym
+from fusion_gym import seeds
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes, run_priced
@@ -26,7 +27,7 @@ from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run
-from fusion_gym.training.calibration import SEED, _choice, calibrate, fit_slopes
+from fusion_gym.training.calibration import _choice, calibrate, fit_slopes
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import train
@@ -93,7 +94,7 @@ def test_between_two_prices_the_numbers_are_linear_in_the_logarithm() -> None:
 def test_the_slope_is_the_regression_of_logits_on_log_ratios() -> None:
     task, agent, rule = made()
     slopes = fit_slopes(CalibratedPolicy(task, [agent], (), rule, ()), [0.3], 30)
-    batch, samples = EpisodeBatch.seeded(task, 30, SEED), []
+    batch, samples = EpisodeBatch.seeded(task, 30, seeds.CALIBRATION.start), []
     batch.price = np.full(30, 0.3)
     for _ in range(task.horizon):
         signals = batch.signals()

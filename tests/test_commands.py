@@ -24,7 +24,7 @@ from fusion_gym.output.plain import plain_text
 from fusion_gym.policies.card import ALGORITHMS
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.catalogue import catalogue
-from fusion_gym.training.checked import config_path, load_checked, parse
+from fusion_gym.training.checked import checked, config_path, load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.validation import ConfigurationError
 
@@ -190,6 +190,6 @@ def test_every_algorithm_can_be_loaded_by_its_name() -> None:
             "training": {"timesteps": 1},
             "output": "unused",
         }
-        experiment = parse(Experiment, plain, "test")
+        experiment = checked(Experiment, plain, "config 'test'")
         assert type(experiment.algorithm) is row.config
-        assert parse(Experiment, experiment.model_dump(), "test") == experiment
+        assert checked(Experiment, experiment.model_dump(), "config 'test'") == experiment

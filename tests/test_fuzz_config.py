@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fusion_gym import ConfigurationError
 from fusion_gym.training.algorithms import TABLE
-from fusion_gym.training.checked import load_checked, parse
+from fusion_gym.training.checked import checked, load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import check_run
 
@@ -60,7 +60,7 @@ def values(default: Any) -> st.SearchStrategy[Any]:
 def flaw(content: Content, path: tuple[str, ...]) -> str | None:
     """What is wrong with how a config is taken whose field at this path was changed."""
     try:
-        model, env, _ = check_run(parse(Experiment, content, "fuzz.yaml"))
+        model, env, _ = check_run(checked(Experiment, content, "config 'fuzz.yaml'"))
     except ConfigurationError as error:
         message = str(error)
         named = any(name in message for name in (*path[-2:], *_UNKNOWN))
@@ -76,7 +76,7 @@ def flaw(content: Content, path: tuple[str, ...]) -> str | None:
 def test_any_value_in_any_field(kind: str, tries: int, tmp_path: Path) -> None:
     base = plain(kind) | {"output": str(tmp_path / "run")}
     assert flaw(base, ()) is None
-    ways = list(fields(parse(Experiment, base, "base.yaml"), base))
+    ways = list(fields(checked(Experiment, base, "config 'base.yaml'"), base))
 
     @settings(max_examples=tries, derandomize=True, phases=[Phase.generate], **FREE)
     @given(st.data())

@@ -8,7 +8,7 @@ import torch
 
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.training.checked import parse
+from fusion_gym.training.checked import checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.models import make_model
 from fusion_gym.validation import ConfigurationError
@@ -25,7 +25,7 @@ def experiment(algorithm: str = "ppo", local: bool = False, **options: Any) -> E
     }
     if algorithm == "a2c":
         content["algorithm"]["n_steps"] = 8
-    return parse(Experiment, content, "test")
+    return checked(Experiment, content, "config 'test'")
 
 
 @pytest.mark.parametrize(
@@ -83,4 +83,4 @@ def test_an_initial_rate_that_is_not_allowed(algorithm: str, value: float) -> No
     content = experiment().model_dump()
     content["algorithm"] = {"name": algorithm, "initial_rate": value}
     with pytest.raises(ConfigurationError, match="initial_rate"):
-        parse(Experiment, content, "test")
+        checked(Experiment, content, "config 'test'")

@@ -2,9 +2,12 @@
 
 import ast
 import functools
+import itertools
 from pathlib import Path
 
 import pytest
+
+from fusion_gym import seeds
 
 ROOT = Path(__file__).parent.parent
 # Each package may import from the floors below its own, and from itself.
@@ -12,11 +15,13 @@ FLOORS = {
     "arrays": 0,
     "declaration": 0,
     "docstrings": 0,
+    "entries": 0,
     "errors": 0,
     "gaussian": 0,
     "importing": 0,
     "linalg": 0,
     "namespace": 0,
+    "seeds": 0,
     "validation": 0,
     "version": 0,
     "yaml_text": 0,
@@ -114,3 +119,14 @@ def test_what_knows_no_environment_imports_no_gymnasium(package: str) -> None:
         assert "import gymnasium" not in text, path
         assert "from gymnasium" not in text, path
         assert package != "core" or len(text.splitlines()) <= 450, path
+
+
+def test_every_purpose_has_seeds_of_its_own() -> None:
+    """The ranges of seeds are disjoint, and no module writes a seed of one as a literal."""
+    ranges = sorted((r for r in vars(seeds).values() if isinstance(r, range)), key=min)
+    assert all(low.stop <= high.start for low, high in itertools.pairwise(ranges))
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and type(node.value) is int:
+                used = [r for r in ranges if r != seeds.TEST and node.value in r]
+                assert not used or module == "fusion_gym.seeds", (module, node.value)

@@ -32,7 +32,7 @@ from agents.benchmark.report import print_classes, write_results
 from agents.benchmark.settings import ClassName, load_suite
 from agents.workers import BackendName, Pool
 from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.options import OutputFolder, Whole, writable_folder
+from fusion_gym.commands.options import OUTPUT_FOLDER, whole, writable_folder
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.folders import lock_folder
 from fusion_gym.output.progress import remark, writing
@@ -55,11 +55,11 @@ class Benchmark(Long):
     """Class of the policy."""
     second_search: bool = False
     """Only search three classes again, with four times the generations, and compare."""
-    results: Annotated[Path | None, OutputFolder()] = None
+    results: Annotated[Path | None, OUTPUT_FOLDER] = None
     """Folder for tables, figures and README.md: results, or runs/benchmark/results with --quick."""
-    work: Annotated[Path, OutputFolder()] = Path("runs/benchmark")
+    work: Annotated[Path, OUTPUT_FOLDER] = Path("runs/benchmark")
     """Folder for finished pieces of work and agents."""
-    workers: Annotated[int, Whole(1, 512)] = 2
+    workers: Annotated[int, whole(1, 512)] = 2
     """Number of parallel processes."""
     backend: BackendName = "loky"
     """Processes of this machine, or a dask cluster."""

@@ -39,6 +39,7 @@ from agents.benchmark.verdict import (
     mean_difference,
     run_test,
 )
+from fusion_gym import seeds
 from fusion_gym.core.knowledge import covers
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -244,8 +245,9 @@ def search_again(suite: Suite, runner: Runner) -> list[Evidence]:
     drawn = np.random.default_rng(0).choice(len(classes), min(3, len(classes)), replace=False)
     classes = [classes[place] for place in sorted(drawn)]
     generations, folder = 4 * suite.generations, runner.folder / "searches"
+    again = seeds.TRAINING[seeds.SECOND]
     jobs = [
-        SearchJob(item.setting, item.name, item.prices, generations, folder, 2_000_000_000)
+        SearchJob(item.setting, item.name, item.prices, generations, folder, again)
         for item in classes
     ]
     texts = [f"{text},price={{price}}" for text in runner.run(run_search, jobs, "second searches")]

@@ -12,6 +12,7 @@ import pydantic
 from agents.benchmark.settings import Setting
 from agents.cache import Cache
 from agents.workers import Pool, missing, run_parallel
+from fusion_gym.entries import Plain
 from fusion_gym.evaluation.rule_search import ClassName
 
 AnyJob = TypeVar("AnyJob", bound="Job")
@@ -31,7 +32,7 @@ class Job:
     weight: ClassVar[float] = 30.0
 
     @property
-    def inputs(self) -> dict[str, Any]:
+    def inputs(self) -> Plain:
         """Return its fields as plain data: the key of its result."""
         return {
             field.name: _PLAIN.dump_python(getattr(self, field.name), mode="json")

@@ -13,13 +13,13 @@ import numpy as np
 
 from agents.benchmark.jobs import Job
 from agents.benchmark.settings import (
-    TUNING_SEED,
     Case,
     ClassName,
     Setting,
     ThresholdRule,
     knowledge_of,
 )
+from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import covers
 from fusion_gym.core.scale import prices_at
@@ -86,7 +86,7 @@ class SearchJob(Job):
     prices: tuple[float, ...]
     generations: int
     folder: Path = field(metadata={"key": False})
-    seed: int = 1_000_000_000
+    seed: int = seeds.TRAINING.start
     weight: ClassVar[float] = 110.0
 
 
@@ -130,13 +130,13 @@ def rules_of(
 
 
 def _try(task: Task, rule: ThresholdRule, values: Array, episodes: int) -> list[ThresholdTrial]:
-    return try_thresholds(task, rule.policy, values.tolist(), episodes, TUNING_SEED)
+    return try_thresholds(task, rule.policy, values.tolist(), episodes, seeds.TUNING.start)
 
 
 def _prices(task: Task, trials: Sequence[ThresholdTrial], job: SweepJob) -> tuple[float, ...]:
     """Return the prices at which the best of all trials spends the shares of ``always``."""
     always = make_policy("always", task)
-    most = float(run_episodes(task, always, job.episodes[0], TUNING_SEED).tokens.mean())
+    most = float(run_episodes(task, always, job.episodes[0], seeds.TUNING.start).tokens.mean())
     tokens, error = np.array([(trial.tokens, trial.error) for trial in trials]).T
     prices = prices_at(tokens, error, np.array(job.shares) * most)
     for place in range(1, len(prices)):

@@ -1,16 +1,17 @@
 """The settings of the benchmark as typed YAML, and the tasks of their classes."""
 
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import pydantic
 
 from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.rule_search import ClassName
 from fusion_gym.training.algorithms import AnyAlgorithm
-from fusion_gym.training.checked import Positive, Rate, Share, Strict, parse, read_yaml
+from fusion_gym.training.checked import Positive, Rate, Share, Strict, checked, read_yaml
 from fusion_gym.training.config import (
     EnvironmentConfig,
     Experiment,
@@ -21,9 +22,7 @@ from fusion_gym.validation import choice
 
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)
 FILE = Path(__file__).with_name("settings.yaml")
-TEST_SEED, TUNING_SEED = 0, 600_000_000  # of the first episodes
 SHORT = 60  # seconds of a short training
-Options = dict[str, Any]
 
 
 class Case(Strict):
@@ -180,7 +179,7 @@ def load_suite(quick: bool = False, settings: tuple[str, ...] = ()) -> Suite:
         choice("settings", name, by_name)
     usual = changes.pop("settings") if quick else by_name
     content["settings"] = [by_name[name] for name in settings or usual]
-    return parse(Suite, content | (changes if quick else {}), str(FILE))
+    return checked(Suite, content | (changes if quick else {}), f"config {str(FILE)!r}")
 
 
 def knowledge_of(setting: Setting, name: ClassName) -> Knowledge:

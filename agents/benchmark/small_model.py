@@ -4,8 +4,8 @@ import io
 import json
 import zipfile
 from pathlib import Path
-from typing import Any
 
+from fusion_gym.entries import Plain
 from fusion_gym.training.checkpoint import DAMAGED
 from fusion_gym.validation import ConfigurationError
 
@@ -35,7 +35,7 @@ def small_model(path: Path) -> bytes:
 
 def _without_runs(content: bytes) -> bytes:
     """Return the settings without the last observations of the training's runs."""
-    data: dict[str, Any] = json.loads(content)
+    data: Plain = json.loads(content)
     return json.dumps(
         {key: None if key in _OF_RUNS else item for key, item in data.items()}
     ).encode()
@@ -45,7 +45,7 @@ def _unused(content: bytes) -> bytes:
     """Return the optimiser's settings without its state."""
     import torch
 
-    data: dict[str, Any] = torch.load(io.BytesIO(content), "cpu", weights_only=True)
+    data: Plain = torch.load(io.BytesIO(content), "cpu", weights_only=True)
     written = io.BytesIO()
     torch.save({**data, "state": {}}, written)
     return written.getvalue()

@@ -6,13 +6,8 @@ import csv
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TypeVar
-
-import pydantic
 
 from fusion_gym.output.files import replacing
-
-Row = TypeVar("Row")
 
 
 @dataclass(frozen=True)
@@ -121,10 +116,3 @@ def write_rows(folder: Path, rows: Sequence[object]) -> None:
         for row in rows:
             values = asdict(row).items()  # type: ignore[call-overload]
             writer.writerow({key: f"{v:.6g}" if isinstance(v, float) else v for key, v in values})
-
-
-def read_rows(folder: Path, kind: type[Row]) -> list[Row]:
-    """Return the rows of a kind."""
-    adapter = pydantic.TypeAdapter(list[kind])  # type: ignore[valid-type]
-    with (folder / f"{KINDS[kind]}.csv").open(newline="") as file:
-        return adapter.validate_python(list(csv.DictReader(file)))

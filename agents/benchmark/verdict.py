@@ -10,7 +10,8 @@ import numpy as np
 from scipy import stats
 
 from agents.benchmark.jobs import Job
-from agents.benchmark.settings import TEST_SEED, Case
+from agents.benchmark.settings import Case
+from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
@@ -71,7 +72,7 @@ def run_test(job: TestJob) -> tuple[TestResult, ...]:
     task, result = job.task(), []
     for text, price in zip(job.policies, job.prices, strict=True):
         policy = make_policy(text, task)
-        results = run_episodes(task, policy, job.episodes, TEST_SEED)
+        results = run_episodes(task, policy, job.episodes, seeds.TEST.start)
         rate, mse = float(results.rate.mean()), float(results.mse.mean())
         result.append(TestResult(text, price, results.error_cost, results.tokens, mse, rate))
     return tuple(result)
@@ -100,9 +101,9 @@ def mean_difference(
     Each pair has the results of one or more seeds in a class, and its reference's results.
     """
     blocks = []
-    for seeds, reference in pairs:
+    for trained, reference in pairs:
         base = np.array([r.cost for r in reference])
-        costs = np.array([[o.cost for o in outcomes] for outcomes in seeds])
+        costs = np.array([[o.cost for o in outcomes] for outcomes in trained])
         blocks.append(((costs - base) / base.mean(1, keepdims=True)).mean(1))
     return _difference(blocks)
 

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from fusion_gym.entries import Plain
+
 
 def stack(figure: Any, count: int, label: str, **style: Any) -> Any:
     """Return axes (count,) in one column, with one label of their common horizontal axis."""
@@ -22,7 +24,7 @@ def legend(
     **style: Any,
 ) -> None:
     """Draw one legend above or below all axes, with each label once, ordered by its rank."""
-    entries: dict[str, Any] = {}
+    entries: Plain = {}
     for axis in np.ravel(axes):
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)

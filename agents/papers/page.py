@@ -11,6 +11,7 @@ from PIL import Image
 
 from agents.papers.numbers import below, cite, estimate, number_text, percent, verdict
 from agents.papers.paper import NAMES, Data, Paper, PaperFigure
+from fusion_gym.entries import Plain
 from fusion_gym.output import palette
 from fusion_gym.output.files import read_json, replacing, write, write_text
 
@@ -19,9 +20,7 @@ TEMPLATES = Path(__file__).parent
 Counts = Mapping[str, Mapping[str, int]]  # episodes and seed of each piece
 
 
-def render_page(
-    paper: Paper, results: Mapping[str, Data], counts: Counts
-) -> tuple[str, dict[str, Any]]:
+def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> tuple[str, Plain]:
     """Return a paper's Markdown from the data of all its pieces, and its numbers as plain JSON."""
     pieces = {
         piece.name: results[piece.name] | piece.summarise(results[piece.name])
@@ -146,4 +145,4 @@ def _fewer_digits(svg: Path) -> None:
 
 _SHADES = 128
 _SMALLER = {"png": _fewer_colours, "svg": _fewer_digits}
-_UNDATED: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}}
+_UNDATED: dict[str, Plain] = {"png": {"Software": None}, "svg": {"Date": None}}

@@ -9,6 +9,7 @@ import numpy as np
 
 import fusion_gym
 from agents.cache import Cache
+from fusion_gym.entries import Plain
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, choice, keys, number, refusal
 
@@ -19,7 +20,7 @@ NAMES = (
     "unknown_input",
     "round_robin_tobit",
 )
-Data = dict[str, Any]
+Data = Plain  # with arrays
 Settings = Mapping[str, Any]
 NOTHING: Settings = MappingProxyType({})
 

@@ -36,7 +36,8 @@ from agents.papers.paper import (
 )
 from agents.workers import Call, Pool, run_parallel
 from fusion_gym.commands.command_line import Command, SetOptions
-from fusion_gym.commands.options import OutputFolder, Seed, Whole
+from fusion_gym.commands.options import OUTPUT_FOLDER, Seed, whole
+from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.folders import lock_folder
@@ -58,17 +59,17 @@ class Reproduce(Command):
     """One figure of one paper, by its number or name, instead of pages."""
     options: SetOptions = ()
     """Parameters of the figure, or options of the paper's environment."""
-    episodes: Annotated[int | None, Whole(2, 100_000_000)] = None
+    episodes: Annotated[int | None, whole(2, 100_000_000)] = None
     """Episodes of every simulation, instead of its own number."""
     seed: Seed = 0
     """Seed of the first episode."""
     resume: bool = False
     """Reuse finished simulations."""
-    output: Annotated[Path | None, OutputFolder()] = None
+    output: Annotated[Path | None, OUTPUT_FOLDER] = None
     """Folder for pages, figures and numbers: docs/reproduction, or runs/figures for a figure."""
-    work: Annotated[Path, OutputFolder()] = Path("runs/reproduction")
+    work: Annotated[Path, OUTPUT_FOLDER] = Path("runs/reproduction")
     """Folder for simulations."""
-    workers: Annotated[int, Whole(1, 512)] = 2
+    workers: Annotated[int, whole(1, 512)] = 2
     """Number of parallel processes."""
 
     def run(self) -> None:
@@ -103,7 +104,7 @@ class Reproduce(Command):
                 print(f"{paper.name}: {output / paper.name}.md")
             write_overview(output)
 
-    def _reproduce_figure(self, paper: Paper, name: str, changes: dict[str, Any]) -> None:
+    def _reproduce_figure(self, paper: Paper, name: str, changes: Plain) -> None:
         name, figure = paper.figure(name)
         settings = paper.settings(changes, figure.without)
         path = (self.output or Path("runs/figures")) / paper.name / name

@@ -29,6 +29,7 @@ from agents.papers.paper import (
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Options, Plain
 from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.output import palette
@@ -45,13 +46,13 @@ TABLE_III = {
     0.1: (0.0948, 0.3707, 0.2082),
     0.06: (0.0742, 0.2924, 0.1601),
 }
-_BOTH: dict[str, dict[str, Any]] = {"aware": {}, "unaware": {"bias_aware": False}}
+_BOTH: dict[str, Options] = {"aware": {}, "unaware": {"bias_aware": False}}
 _FILTERS = {"paper": "the paper's filter", "adf": "assumed-density filter"}
 _LOCAL = ("single", "node")
 _ENDS = ("mean", "low", "high")
 
 
-def _options(interval: float, variance: float) -> dict[str, Any]:
+def _options(interval: float, variance: float) -> Options:
     return {
         "censoring_threshold": -interval, "censoring_upper": interval,
         "measurement_variance": variance,
@@ -231,7 +232,7 @@ def _median(values: Array) -> dict[str, list[float]]:
     return {"median": [middle, *np.quantile(drawn, [0.025, 0.975]).tolist()]}
 
 
-def _rise(before: Array, after: Array) -> dict[str, Any]:
+def _rise(before: Array, after: Array) -> Plain:
     """Return the paired intervals of ARMSE1, 2, 3 and the median from one row to the next."""
     result = runs.increase(before, after)
     middle = np.quantile(runs.medians(after)[1] - runs.medians(before)[1], [0.025, 0.975])
@@ -277,7 +278,7 @@ def _summarise_tables(data: Data) -> Data:
     }  # fmt: skip
 
 
-def _broken(data: Data, printed: dict[str, Any]) -> Data:
+def _broken(data: Data, printed: Plain) -> Data:
     """Return how many printed values lie below every filter's bound."""
     entries = [
         (value, row["floor"][i], row["floor_all"][i])

@@ -23,6 +23,7 @@ from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Options, Plain
 from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
 
@@ -31,7 +32,7 @@ _DRAWS = 200  # measurements an episode, at each of them
 SHARES = ((0.5, 0.5), (0.9, 0.1), (0.1, 0.9))
 SURE = 0.05  # predicted probability of no censoring, at most, of a surprise
 # Where the bounds are tried: a head of the table, and what it stands for.
-EXAMPLES: dict[str, tuple[str, dict[str, Any]]] = {
+EXAMPLES: dict[str, tuple[str, Options]] = {
     "oscillator": (OSCILLATOR, {}),
     "oscillator, [-0.5, 0.5]": (OSCILLATOR, {"censoring_threshold": -0.5, "censoring_upper": 0.5}),
     "target, uncensored": (TRACKING, {}),
@@ -67,7 +68,7 @@ def simulate_theory(episodes: int, seed: int, settings: Settings) -> Data:
     }  # fmt: skip
 
 
-def _lemma(episodes: int, seed: int) -> dict[str, Any]:
+def _lemma(episodes: int, seed: int) -> Plain:
     """Mean and variance of y at fixed states: simulated, with standard errors, and by Lemma 1."""
     sensors = censored(fusion_gym.make_task(OSCILLATOR)).centre.sensors
     places, draws = np.array(PLACES), episodes * _DRAWS
@@ -90,7 +91,7 @@ def _lemma(episodes: int, seed: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
+def _errors(env: str, episodes: int, seed: int) -> Plain:
     """Consistency, censoring probabilities and correlation in time, along the round robin."""
     task = fusion_gym.make_task(env)
     names = ("nees", "predicted", "uncensored", "sure", "surprised", "product", "first", "second")
@@ -125,11 +126,11 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
     return values
 
 
-def _fusion(episodes: int, seed: int) -> dict[str, Any]:
+def _fusion(episodes: int, seed: int) -> Plain:
     """Return the change of the fused estimate with the shares ε, and with B = 0 with the bias."""
     split = [fusion_gym.make_task(OSCILLATOR, information_shares=[*each]) for each in SHARES]
     means = [_means(task, episodes, seed) for task in split]
-    no_bias: dict[str, Any] = {"access": "any", "bias_gain": [[0.0], [0.0]]}
+    no_bias: Options = {"access": "any", "bias_gain": [[0.0], [0.0]]}
     tasks = [fusion_gym.make_task(OSCILLATOR, bias_aware=own, **no_bias) for own in (True, False)]
     without = [_means(task, episodes, seed, "always")[..., :2, :] for task in tasks]
     return {
@@ -146,13 +147,13 @@ def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> 
     return values
 
 
-def _worth(episodes: int, seed: int) -> dict[str, Any]:
+def _worth(episodes: int, seed: int) -> Options:
     """Return squared errors (episodes,), summed over states, of other filters on the same data."""
-    settings: dict[str, dict[str, Any]] = {
+    settings: dict[str, Plain] = {
         "paper": {}, "adf": {"filter": "adf"}, "kalman": {"filter": "kalman"},
         "free": {"filter": "kalman"} | FREE, "calm": {"bias_noise_covariance": [[0.0025]]},
     }  # fmt: skip
-    data: dict[str, Any] = {}
+    data: Plain = {}
     for name, options in settings.items():
         task = fusion_gym.make_task(OSCILLATOR, **options)
         errors = measures.squares(task, "round_robin", episodes, seed)

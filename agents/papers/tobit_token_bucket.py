@@ -17,6 +17,7 @@ from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Sett
 from agents.papers.tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
+from fusion_gym.entries import Options
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.output.palette import FUSED, INK, MEASURED, TRUTH
 from fusion_gym.output.palette import SENSORS as COLOURS
@@ -30,7 +31,7 @@ _CURVES = ("local_error", "local_trace", "fused_error", "fused_trace")
 _LONG, _WINDOW = 1000, 200  # steps
 # What each reading changes. The paper's text leaves the first two open; the others take out what
 # it has in its filter, and the last puts the standard Tobit Kalman filter in its place.
-READINGS: dict[str, dict[str, Any]] = {
+READINGS: dict[str, Options] = {
     "as printed, one noise of variance 0.05 on B": {},
     "noise of covariance diag(0.05, 0.05) on the states": {"process_noise": "full"},
     "nothing arrives: prediction, no held update": {"silent": "predict"},

@@ -19,6 +19,7 @@ from agents.papers.unknown_input_recursion import EXACT_CUTOFF
 from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Options
 from fusion_gym.output import palette
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
@@ -31,7 +32,7 @@ NAMES = {PRINTED: "the printed example", CARTS: "two carts"}
 TRIGGER = "adaptive_threshold"
 OURS, FIXED = "paper's filter and trigger", "paper's filter, fixed threshold ρ̄"
 WALK = "Kalman filter with a random-walk input, paper's trigger"
-LANES: dict[str, tuple[str, dict[str, Any]]] = {
+LANES: dict[str, tuple[str, Options]] = {
     OURS: (TRIGGER, {"filter": "paper"}),
     FIXED: (TRIGGER, {"filter": "paper"}),
     "paper's filter, always": ("always", {"filter": "paper"}),

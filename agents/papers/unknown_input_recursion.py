@@ -1,12 +1,13 @@
 """The recursion (17)-(20) of unknown_input as printed, and its readings."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from fusion_gym.arrays import Array
+from fusion_gym.entries import Options, Plain
 from fusion_gym.systems.unknown_input.system import DrivenPlant
 
 # I - C ℬ L in (20) is a projection, its singular values are 0 or at least 1: what lies between is
@@ -14,7 +15,7 @@ from fusion_gym.systems.unknown_input.system import DrivenPlant
 EXACT_CUTOFF, _SOME, _MACHINE = 0.5, 1e-8, 0.0
 EXACT, INVERTED = "(20), rounding set to zero", "(20), rounding inverted by the pseudo-inverse"
 PARTLY, DEVIATIONS = "(20), rounding above 1e-8 inverted", "0.001 as standard deviations"
-UNKNOWN_INPUT_READINGS: dict[str, dict[str, Any]] = {
+UNKNOWN_INPUT_READINGS: dict[str, Options] = {
     EXACT: {},
     INVERTED: {"cutoff": _MACHINE},
     PARTLY: {"cutoff": _SOME},
@@ -123,7 +124,7 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
 _TRACES = ("state_bound", "best_bound")
 
 
-def decoupling(paper: DrivenPlant, every_step: DrivenPlant) -> dict[str, Any]:
+def decoupling(paper: DrivenPlant, every_step: DrivenPlant) -> Plain:
     """Return rank and columns of C ℬ with ℬ as (3) prints it, for a = 2, and error bounds.
 
     ``conditions`` are the condition numbers of the C_i and of B, ``floor`` the result of

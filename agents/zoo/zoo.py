@@ -11,15 +11,16 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from agents.benchmark.evidence import Evidence, gather
 from agents.benchmark.jobs import Runner
-from agents.benchmark.settings import TEST_SEED, Suite, knowledge_of, load_suite
+from agents.benchmark.settings import Suite, knowledge_of, load_suite
 from agents.workers import Pool
-from fusion_gym import zoo
+from fusion_gym import seeds, zoo
 from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.options import OutputFolder, Whole
+from fusion_gym.commands.options import OUTPUT_FOLDER, whole
+from fusion_gym.entries import Plain
 from fusion_gym.output.files import read_json, replacing, write
 from fusion_gym.output.progress import writing
 
@@ -32,11 +33,11 @@ class Zoo(Long):
 
     settings: tuple[str, ...] = ()
     """Settings by name; all by default."""
-    work: Annotated[Path, OutputFolder()] = Path("runs/benchmark")
+    work: Annotated[Path, OUTPUT_FOLDER] = Path("runs/benchmark")
     """Folder of the benchmark's finished pieces and agents."""
-    zoo: Annotated[Path, OutputFolder()] = Path(zoo.__file__).parent
+    zoo: Annotated[Path, OUTPUT_FOLDER] = Path(zoo.__file__).parent
     """Folder of the model zoo."""
-    workers: Annotated[int, Whole(1, 512)] = 2
+    workers: Annotated[int, whole(1, 512)] = 2
     """Number of parallel processes."""
 
     def run(self) -> None:
@@ -57,7 +58,7 @@ class Zoo(Long):
             print(f"zoo:{name} is removed")
 
 
-def agent_card(suite: Suite, item: Evidence, model: bytes) -> dict[str, Any]:
+def agent_card(suite: Suite, item: Evidence, model: bytes) -> Plain:
     """Return the content of an agent's JSON."""
     seed = item.best_seed
     experiment = item.trainings["agent"][seed][0].experiment
@@ -74,7 +75,7 @@ def agent_card(suite: Suite, item: Evidence, model: bytes) -> dict[str, Any]:
         "command": f"python -m agents.zoo --settings {item.setting.name}, training seed {seed}",
         "test": {
             "episodes": suite.episodes,
-            "seed": TEST_SEED,
+            "seed": seeds.TEST.start,
             "prices": list(item.prices),
             "points": [
                 {

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from fusion_gym import zoo
 from fusion_gym.commands.command_line import EnvironmentOptions, Long, PolicyNames
-from fusion_gym.commands.options import OutputFile, Whole
+from fusion_gym.commands.options import OutputFile, whole
 from fusion_gym.commands.search import token_prices
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output import tables
@@ -40,9 +40,9 @@ class Calibrate(EnvironmentOptions, Long):
     """The file of the calibrated policy."""
     rule: str | None = None
     """Text of a priced_threshold, as search prints it; by default the start of a search."""
-    prices: Annotated[int, Whole(2, 100)] = 5
+    prices: Annotated[int, whole(2, 100)] = 5
     """Number of prices of a token, from the lowest to the highest."""
-    episodes: Annotated[int, Whole(2, 100_000)] = EPISODES[1]
+    episodes: Annotated[int, whole(2, 100_000)] = EPISODES[1]
     """Tuning episodes of the last round."""
 
     keeps = False

@@ -16,6 +16,7 @@ import tyro
 
 from fusion_gym.commands.options import check_options
 from fusion_gym.docstrings import plain_marks
+from fusion_gym.entries import Options
 from fusion_gym.importing import trust_files
 from fusion_gym.output.ending import flush, report_errors
 from fusion_gym.output.progress import quietly
@@ -114,7 +115,7 @@ class EnvironmentOptions:
     options: SetOptions = field(default=(), kw_only=True)
     """Options of gym.make for the environment; they override all others."""
 
-    def environment(self) -> tuple[str, dict[str, Any]]:
+    def environment(self) -> tuple[str, Options]:
         """Return the id and the options of the environment."""
         options = parse_settings("option", list(itertools.chain(*self.options)))
         if self.config is None and self.env is None:

@@ -17,16 +17,17 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from rich.table import Table
 
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.evaluate import evaluation_report
-from fusion_gym.commands.options import Episodes, OutputFolder, Seed, Whole
+from fusion_gym.commands.options import OUTPUT_FOLDER, Episodes, Seed, whole
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Plain
 from fusion_gym.envs.registration import class_name, make_task
 from fusion_gym.evaluation.envelope import (
     FAR_APART,
@@ -57,13 +58,13 @@ class Compare(Long):
     """The baselines: a YAML file, or the name of a shipped sweep."""
     policy: str
     """The policy, for example model:PATH."""
-    output: Annotated[Path, OutputFolder()]
+    output: Annotated[Path, OUTPUT_FOLDER]
     """Folder for the results."""
     episodes: Episodes = 1000
     """Episodes of each policy."""
     seed: Seed = 0
     """Seed of the first episode."""
-    prices: Annotated[int | None, Whole(2, 1000)] = None
+    prices: Annotated[int | None, whole(2, 1000)] = None
     """Run the policy at this many prices over the config's price_range."""
 
     keeps = False
@@ -176,7 +177,7 @@ class Point(NamedTuple):
     at_price: PriceComparison
     at_rate: BaselineComparison
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> Plain:
         """Return the point as JSON."""
         return self._asdict() | {
             name: comparison._asdict() | {"difference": comparison.difference._asdict()}

@@ -14,7 +14,7 @@ from typing import Annotated
 
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.compare import Compare
-from fusion_gym.commands.options import Episodes, OutputFolder, Steps
+from fusion_gym.commands.options import OUTPUT_FOLDER, Episodes, Steps
 from fusion_gym.commands.train import Train
 from fusion_gym.training.run import holds_training
 
@@ -25,7 +25,7 @@ CONFIGS = {"linear_fusion": "linear_fusion_front", "tobit_oscillator": "tobit_os
 class Demo(Long):
     """Train two agents and compare them with rules under the same budget, in minutes."""
 
-    output: Annotated[Path, OutputFolder()] = Path("runs/demo")
+    output: Annotated[Path, OUTPUT_FOLDER] = Path("runs/demo")
     """Folder for agents, tables and figures."""
     episodes: Episodes = 1000
     """Episodes of each policy."""

@@ -12,13 +12,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import pydantic
 
 from fusion_gym.commands.command_line import EnvironmentOptions, Long, PolicyNames
 from fusion_gym.commands.options import Episodes, OutputFile, Seed
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Arguments, Plain
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import Interval, mean_interval
@@ -42,7 +43,7 @@ class Quantiles(pydantic.BaseModel):
 
 # A policy in the JSON of an evaluation: an interval for a metric, or a list.
 _Row = Annotated[list[float], pydantic.Field(min_length=1)]
-_FIELDS: dict[str, Any] = {
+_FIELDS: Arguments = {
     name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()
 }
 EVALUATED = pydantic.create_model("EVALUATED", **_FIELDS)
@@ -157,7 +158,7 @@ def warn_of_draws(
 
 def evaluation_report(
     env_id: str, task: Task, episodes: int, seed: int, results: Mapping[str, EpisodeResults]
-) -> dict[str, Any]:
+) -> Plain:
     """Return the JSON of an evaluation."""
     return {
         "env": env_id,
@@ -171,7 +172,7 @@ def evaluation_report(
     }
 
 
-def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
+def finished(path: Path | None, report: Plain) -> Plain:
     """Return the JSON of an earlier run of the same evaluation."""
     if path is None:
         raise ConfigurationError("resume = True is not allowed without json: there is no file")

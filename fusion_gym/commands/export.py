@@ -9,13 +9,14 @@ removes it if they differ.
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from fusion_gym import zoo
 from fusion_gym.commands.command_line import Command, EnvironmentOptions
 from fusion_gym.commands.options import OutputFile
+from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.errors import forbidden
 from fusion_gym.importing import require
@@ -88,7 +89,7 @@ def spec(text: str) -> str:
     raise refusal("model", text, "zoo:NAME, model:PATH or the path of a .zip")
 
 
-def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:
+def _environment(command: Export, kind: str, name: str) -> tuple[str, Options]:
     """Return id and options of the command line, or of the agent's training by default."""
     if command.env is None and command.config is None:
         if kind == "zoo":

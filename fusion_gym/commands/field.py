@@ -15,7 +15,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import joblib
 import numpy as np
@@ -23,7 +23,8 @@ import tyro
 
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.fit import plant_text
-from fusion_gym.commands.options import Between, OutputFolder, Whole
+from fusion_gym.commands.options import OUTPUT_FOLDER, between, whole
+from fusion_gym.entries import Options, Plain
 from fusion_gym.evaluation.field_study import (
     ENV,
     METHODS,
@@ -65,19 +66,19 @@ class Field(Long):
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
     """The CSV file, or mast or tanks; fusion-gym info shows its data card."""
-    target_rate: Annotated[float, Between(0.0, 0.5)] = 0.05
+    target_rate: Annotated[float, between(0.0, 0.5)] = 0.05
     """Packets a sensor and step at which rules are compared."""
-    output: Annotated[Path, OutputFolder()] = Path("runs/field")
+    output: Annotated[Path, OUTPUT_FOLDER] = Path("runs/field")
     """Folder of the report."""
     channels: tuple[str, ...] = ()
     """Channels by name; by default all without a fault."""
-    share: Annotated[float, Between(0.0, 0.95)] = 0.5
+    share: Annotated[float, between(0.0, 0.95)] = 0.5
     """Share of the log, from its start, for the fit."""
     exact: bool = False
     """The readings are the truth: fit no measurement noise."""
-    timesteps: Annotated[int, Whole(1, 10**9)] = 200_000
+    timesteps: Annotated[int, whole(1, 10**9)] = 200_000
     """Steps of the agent's training."""
-    workers: Annotated[int, Whole(1, 512)] = 2
+    workers: Annotated[int, whole(1, 512)] = 2
     """Number of parallel processes."""
     resume: bool = False
     """Continue with the methods that the folder lacks."""
@@ -86,7 +87,7 @@ class Field(Long):
         """Fit, tune, train, measure and report."""
         whole = Recording.read(self.log)
         recording = whole.select(self.channels)
-        inputs: dict[str, Any] = {"log": joblib.hash(whole.values), "target_rate": self.target_rate}
+        inputs: Plain = {"log": joblib.hash(whole.values), "target_rate": self.target_rate}
         inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
         place = self.output / "study.json"
         if place.exists() and not self.resume:
@@ -168,7 +169,7 @@ def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodP
     )
     middle = (few[0] - many[0]) / (many[1] - few[1]) / len(study.shape)
     prices = [float(f"{middle * factor:.4g}") for factor in np.geomspace(1 / _PRICES, _PRICES, 5)]
-    drawn: dict[str, Any] = {"cost_weight": "random", "price_range": [prices[0], prices[-1]]}
+    drawn: Options = {"cost_weight": "random", "price_range": [prices[0], prices[-1]]}
     free = {"tokens": "unlimited", "token_cost": 1.0, "horizon": study.horizon, "filter": "joint",
             "reward_scale": 1.0}  # fmt: skip
     options = {**study.options, **free, **drawn, "source": study.source}

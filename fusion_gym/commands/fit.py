@@ -16,7 +16,7 @@ import tyro
 import yaml
 
 from fusion_gym.commands.command_line import Command
-from fusion_gym.commands.options import Between, OutputFile
+from fusion_gym.commands.options import OutputFile, between
 from fusion_gym.output.data_card import RATIOS, criticism_rows
 from fusion_gym.output.files import write_text
 from fusion_gym.output.progress import remark, writing
@@ -42,7 +42,7 @@ class Fit(Command):
     """The option file."""
     channels: tuple[str, ...] = ()
     """Channels by name; by default all without a fault."""
-    share: Annotated[float, Between(0.0, 0.95)] = 0.5
+    share: Annotated[float, between(0.0, 0.95)] = 0.5
     """Share of the log, from its start, for the fit."""
     exact: bool = False
     """The readings are the truth: fit no measurement noise."""

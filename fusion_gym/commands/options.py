@@ -1,6 +1,6 @@
 """Marks in the types of a command's fields: the allowed values of its options.
 
-    episodes: Annotated[int, Whole(at_least=1)] = 1000
+    episodes: Annotated[int, whole(1)] = 1000
     json: Annotated[Path | None, OutputFile(".json")] = None
 
 The marks are checked before the command runs. ``None`` is an option without a value; in a list
@@ -10,100 +10,73 @@ every entry is checked.
 import errno
 import os
 import tempfile
-import typing
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
+from fusion_gym import declaration
+from fusion_gym.declaration import Mark
 from fusion_gym.validation import integer, number, refusal
 
 
-@dataclass(frozen=True)
-class Whole:
-    """A whole number within limits."""
-
-    at_least: int
-    at_most: int | None = None
-
-    def check(self, option: str, value: Any) -> None:
-        """Check one number."""
-        integer(option, value, at_least=self.at_least, at_most=self.at_most)
+def whole(at_least: int, at_most: int | None = None) -> Mark:
+    """Return the mark of a whole number within limits."""
+    return Mark(integer, at_least=at_least, at_most=at_most)
 
 
-@dataclass(frozen=True)
-class Between:
-    """A finite number above one limit, and at most the other."""
-
-    above: float
-    at_most: float
-
-    def check(self, option: str, value: Any) -> None:
-        """Check one number."""
-        number(option, value, above=self.above, at_most=self.at_most)
+def between(above: float, at_most: float) -> Mark:
+    """Return the mark of a finite number above one limit, and at most the other."""
+    return Mark(number, above=above, at_most=at_most)
 
 
-class OutputFolder:
-    """A folder that can be written or created."""
+class OutputFile(Mark):
+    """The mark of a file with one of the given endings, which can be replaced or created."""
 
-    def check(self, option: str, value: Any) -> None:
-        """Check that the folder can be written, without a trace."""
-        writable_folder(option, Path(value))
+    def __new__(cls, *endings: str) -> Self:
+        """Return a check of the ending, unless it is a device, and that its folder is writable."""
+        return super().__new__(cls, writable_file, endings=endings)
 
-
-class OutputFile:
-    """A file with one of the given endings, which can be replaced or created."""
-
-    def __init__(self, *endings: str) -> None:
-        self.endings = endings
-
-    def check(self, option: str, value: Any) -> None:
-        """Check the ending of a path, unless it is a device, and that its folder can be written."""
-        path = Path(value)
-        device = os.path.exists(path) and not os.path.isfile(path)  # false without access
-        if path.suffix.lower() not in self.endings and not device:
-            raise refusal(option, str(path), f"a file that ends with {' or '.join(self.endings)}")
-        writable_file(option, path)
-
-
-Mark = Whole | Between | OutputFolder | OutputFile
 
 # Larger numbers would exceed any time or memory.
-Episodes = Annotated[int, Whole(1, 100_000_000)]
-Steps = Annotated[int | None, Whole(1, 10**12)]
-Seed = Annotated[int, Whole(0)]
-TrainingSeed = Annotated[int | None, Whole(0, 2**32 - 1)]  # the limits of torch and numpy
+Episodes = Annotated[int, whole(1, 100_000_000)]
+Steps = Annotated[int | None, whole(1, 10**12)]
+Seed = Annotated[int, whole(0)]
+TrainingSeed = Annotated[int | None, whole(0, 2**32 - 1)]  # the limits of torch and numpy
 
 
 def check_options(values: Any) -> None:
-    """Check every field of a command by its marks."""
-    hints = typing.get_type_hints(type(values), include_extras=True)
-    for field in fields(values):
-        value = getattr(values, field.name)
-        for mark in getattr(hints[field.name], "__metadata__", ()):
-            if isinstance(mark, Mark) and value is not None:
-                for entry in value if isinstance(value, tuple) else (value,):
-                    mark.check(field.name, entry)
-            if isinstance(mark, OutputFile) and value is not None:
-                _refuse_input(values, field.name, value)
+    """Check every field of a command by its type, and that no output replaces an input."""
+    declaration.check(values)
+    for name, hint in declaration.hints(type(values)).items():
+        marks = getattr(hint, "__metadata__", ())
+        if any(isinstance(mark, OutputFile) for mark in marks):
+            _refuse_input(values, name, getattr(values, name))
 
 
-def _refuse_input(values: Any, option: str, path: Path) -> None:
+def _refuse_input(values: Any, option: str, path: Path | None) -> None:
     """Refuse to replace a file that another option names."""
     for name in {field.name for field in fields(values)} - {option}:
         other = getattr(values, name)
-        named = isinstance(other, str | Path) and os.path.exists(other) and os.path.exists(path)
-        if named and path.samefile(other):
+        named = isinstance(other, str | Path) and os.path.exists(other)
+        if named and path is not None and os.path.exists(path) and path.samefile(other):
             raise refusal(option, str(path), f"another file than {name}")
 
 
-def writable_folder(option: str, folder: Path) -> None:
+def writable_folder(option: str, path: str | Path) -> None:
     """Check, without a trace, that files can be written into a folder, which need not exist."""
+    folder = Path(path)
     _try_out(option, folder, "a folder that can be written", lambda: _write_in(folder))
 
 
-def writable_file(option: str, file: Path) -> None:
-    """Check, without a trace, that a file can be replaced or created."""
+OUTPUT_FOLDER = Mark(writable_folder)
+
+
+def writable_file(option: str, file: Path, endings: tuple[str, ...]) -> None:
+    """Check, without a trace, that a file of these endings can be replaced or created."""
+    device = os.path.exists(file) and not os.path.isfile(file)  # false without access
+    if file.suffix.lower() not in endings and not device:
+        raise refusal(option, str(file), f"a file that ends with {' or '.join(endings)}")
 
     def write() -> None:
         if file.is_dir():

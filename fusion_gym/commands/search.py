@@ -15,15 +15,16 @@ episodes, and the cost of the best single threshold there.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
 from rich.table import Table
 
 from fusion_gym.commands.command_line import EnvironmentOptions, Long
-from fusion_gym.commands.options import OutputFolder, Whole
+from fusion_gym.commands.options import OUTPUT_FOLDER, whole
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Options, Plain
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.rule_search import (
     ClassName,
@@ -48,13 +49,13 @@ _GENERATIONS, _RESULT = "generations.json", "search.json"
 class Search(EnvironmentOptions, Long):
     """Search one rule for all prices of a token."""
 
-    output: Annotated[Path, OutputFolder()]
+    output: Annotated[Path, OUTPUT_FOLDER]
     """Folder of the search."""
     class_name: Annotated[ClassName, tyro.conf.arg(name="class")] = "scheduler"
     """Who decides: a scheduler with all measurements, every sensor locally, or the centre."""
-    prices: Annotated[int, Whole(2, 100)] = 5
+    prices: Annotated[int, whole(2, 100)] = 5
     """Number of prices of a token, from the lowest to the highest."""
-    generations: Annotated[int, Whole(1, 10_000)] = 30
+    generations: Annotated[int, whole(1, 10_000)] = 30
     """Number of generations."""
     resume: bool = False
     """Continue after the generations in the folder."""
@@ -66,7 +67,7 @@ class Search(EnvironmentOptions, Long):
         prices = token_prices(env_id, options, task, self.prices)
         search = search_of_class(self.class_name, task, prices, generations=self.generations)
         make_policy(search.text, task)  # refuses before it creates a folder
-        inputs: dict[str, Any] = {"env": env_id, "class": self.class_name, "prices": search.prices}
+        inputs: Plain = {"env": env_id, "class": self.class_name, "prices": search.prices}
         inputs |= {"generations": self.generations, "settings": search.task.settings}
         self.earlier(inputs)  # refuses before it creates a folder
         with lock_folder(self.output, "output"):
@@ -76,7 +77,7 @@ class Search(EnvironmentOptions, Long):
         print(result.policy)
         tables.console().print(result_table(env_id, result))
 
-    def continued(self, search: RuleSearch, inputs: dict[str, Any]) -> SearchResult:
+    def continued(self, search: RuleSearch, inputs: Plain) -> SearchResult:
         """Run the search after its earlier generations, and write every generation to the file."""
         generations = self.earlier(inputs)
         initial = len(generations)
@@ -96,7 +97,7 @@ class Search(EnvironmentOptions, Long):
 
             return search_rule(search, tuple(generations), progress)
 
-    def earlier(self, inputs: dict[str, Any]) -> list[Generation]:
+    def earlier(self, inputs: Plain) -> list[Generation]:
         """Return the generations in the folder, of the same search."""
         path = self.output / _GENERATIONS
         if not self.resume:
@@ -121,7 +122,7 @@ class Search(EnvironmentOptions, Long):
         return super().interrupted() if begun else "interrupted before the search began"
 
 
-def token_prices(env_id: str, options: dict[str, Any], task: Task, count: int) -> tuple[float, ...]:
+def token_prices(env_id: str, options: Options, task: Task, count: int) -> tuple[float, ...]:
     """Return prices at even logarithmic distances over the task's price_range, or over "auto"."""
     span = task.reward.price.span
     if span is None:

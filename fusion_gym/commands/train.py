@@ -27,10 +27,10 @@ from pathlib import Path
 from typing import Annotated
 
 from fusion_gym.commands.command_line import Long, SetOptions
-from fusion_gym.commands.options import OutputFolder, Steps, TrainingSeed, writable_folder
+from fusion_gym.commands.options import OUTPUT_FOLDER, Steps, TrainingSeed, writable_folder
 from fusion_gym.errors import forbidden
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.training.checked import load_checked, parse
+from fusion_gym.training.checked import checked, load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import ConfigurationError
@@ -54,7 +54,7 @@ class Train(Long):
     """Steps of all runs together; by default the config's steps, or a million with --env."""
     seed: TrainingSeed = None
     """Seed of the training, instead of the config's seed."""
-    output: Annotated[str | None, OutputFolder()] = None
+    output: Annotated[str | None, OUTPUT_FOLDER] = None
     """Folder for the results, instead of the config's folder."""
     resume: bool = False
     """Continue from the last checkpoint; resume only your own, since it contains pickles."""
@@ -86,7 +86,7 @@ class Train(Long):
             "training": {"timesteps": TIMESTEPS},
             "output": f"runs/{name}",
         }
-        return parse(Experiment, content, "command line")
+        return checked(Experiment, content, "config 'command line'")
 
     def run(self) -> None:
         """Train up to the number of steps in the config."""

@@ -15,7 +15,7 @@ from typing import Annotated
 import tyro
 
 from fusion_gym.commands.command_line import EnvironmentOptions, Long
-from fusion_gym.commands.options import OutputFile, Seed, Whole
+from fusion_gym.commands.options import OutputFile, Seed, whole
 from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Frame, Window
 from fusion_gym.envs.registration import make_task
@@ -39,9 +39,9 @@ class Watch(EnvironmentOptions, Long):
     """Write a film, .gif or .mp4, instead of showing a window."""
     seed: Seed = 0
     """Seed of the episode."""
-    steps: Annotated[int | None, Whole(1)] = None
+    steps: Annotated[int | None, whole(1)] = None
     """Number of steps; the whole episode by default."""
-    fps: Annotated[int, Whole(1, 50)] = 10
+    fps: Annotated[int, whole(1, 50)] = 10
     """Steps per second."""
 
     def run(self) -> None:

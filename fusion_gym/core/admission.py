@@ -32,7 +32,7 @@ def admit(plant: Plant[Any], horizon: int) -> Array:
             The message has the longest horizon that is allowed.
     """
     open_loop = plant.open_loop(horizon)
-    accuracy = _accuracy(plant, horizon)
+    accuracy = _accuracy(plant, horizon, open_loop)
     if accuracy <= _RIGHT:
         return open_loop
     if accuracy <= _WRONG:
@@ -54,7 +54,9 @@ def admit(plant: Plant[Any], horizon: int) -> Array:
     )
     # The loss of accuracy grows with the horizon.
     longest = bisect_left(
-        range(1, horizon), True, key=lambda steps: not _accuracy(plant, steps) <= _WRONG
+        range(1, horizon),
+        True,
+        key=lambda steps: not _accuracy(plant, steps, plant.open_loop(steps)) <= _WRONG,
     )
     if not longest:
         raise ConfigurationError(f"these numbers together are not allowed: {why}")
@@ -62,9 +64,9 @@ def admit(plant: Plant[Any], horizon: int) -> Array:
     raise refusal("horizon", horizon, allowed, "with this plant and these sensors")
 
 
-def _accuracy(plant: Plant[Any], horizon: int) -> float:
+def _accuracy(plant: Plant[Any], horizon: int, open_loop: Array) -> float:
     """Estimate the largest relative rounding error of means (in deviations) and variances."""
-    if not plant.open_loop(horizon).max() <= LARGEST_ERROR:
+    if not open_loop.max() <= LARGEST_ERROR:
         return np.inf
     signal, loss = plant.rounding(horizon)
     return _PRECISION * float(np.maximum(_OF_SIGNAL * np.sqrt(signal), _OF_LOSS * loss))

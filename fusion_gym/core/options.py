@@ -15,6 +15,7 @@ from fusion_gym.core.channel import Channel
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.noise import NoiseSource
 from fusion_gym.core.plant import Plant
+from fusion_gym.entries import Arguments
 from fusion_gym.errors import refusal
 from fusion_gym.fusion.table import Structure
 from fusion_gym.importing import name_of
@@ -213,7 +214,7 @@ class Scenario:
     plant: Plant[Any]
     estimator: Estimator[Any]
     state_weights: ArrayLike | None = None
-    policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
+    policy_defaults: dict[str, Arguments] = field(default_factory=dict)
     feedback: bool = False
     memory_estimator: Estimator[Any] | None = None
     nodes_have_memory: bool = False

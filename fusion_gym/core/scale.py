@@ -12,16 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from fusion_gym import validation
+from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.options import CommonOptions, Scenario, plain_options
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import TokenBucket
-from fusion_gym.errors import ConfigurationError, display, forbidden
+from fusion_gym.errors import ConfigurationError, DivergenceError, display, forbidden
 
 Build = Callable[[Any], Scenario]
-_RUNS, _STEPS, _SEED = 32, 200, 20_261_124
+_RUNS, _STEPS = len(seeds.SCALE), 200
+_TRIAL = 8  # steps of a rehearsal
 _WORK = 200  # sensors · states² up to which a sweep has all its rules and runs
 # Allowance for rounding, because 49 · (1/49) < 1.
 _ROUNDING = 1e-9
@@ -57,6 +58,23 @@ def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array 
         )
         options = replace(options, price_range=_stored(price_range, rules, build))
     return options, error
+
+
+def rehearse(task: Task) -> None:
+    """Check that runs without, with all and with alternating requests remain finite."""
+    sensors = np.arange(task.sensors)
+    try:
+        batch = EpisodeBatch.seeded(replace(task, backend="numpy"), 3, seed=0)
+        for step in range(min(_TRIAL, task.horizon)):
+            batch.observe()
+            requests = np.stack([sensors < 0, sensors >= 0, (sensors + step) % 2 == 0], axis=-1)
+            batch.step(requests)
+        batch.observe()
+    except DivergenceError as error:
+        raise ConfigurationError(
+            f"these numbers together are not allowed: {error}; they lie too far apart or make a "
+            "covariance singular"
+        ) from None
 
 
 def nominal_rate(bucket: TokenBucket, access: str) -> float:
@@ -167,8 +185,7 @@ def _above(left: int, middle: int, right: int, rate: Array, error: Array) -> boo
 def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
     """Return a batch of ``copies`` copies of the simulation's runs."""
     batch = EpisodeBatch(replace(task, horizon=min(task.horizon, _STEPS)), runs * copies)
-    seeds = np.tile(np.arange(_SEED, _SEED + runs), copies)
-    batch.seed(np.arange(len(seeds)), seeds.tolist())
+    batch.seed(np.arange(runs * copies), [*seeds.SCALE[:runs]] * copies)
     batch.reset()
     return batch
 

@@ -22,6 +22,7 @@ from fusion_gym.core.options import Action, Backend, CommonOptions, Scenario, pl
 from fusion_gym.core.plant import Plant
 from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.entries import Arguments, Options
 
 # Knowledge class of each information mode.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "scheduler", "centre": "centre"}
@@ -95,8 +96,8 @@ class Task:
     vector_reward: bool = False
     backend: str = "numpy"
     nominal_error: Array | None = None
-    settings: dict[str, Any] = field(default_factory=dict)
-    policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
+    settings: Options = field(default_factory=dict)
+    policy_defaults: dict[str, Arguments] = field(default_factory=dict)
     required_policy: str | None = None
     noise: NoiseSource | None = None
 

@@ -17,8 +17,10 @@ from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.reward import TRAINING_ERRORS
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.envs.vector import Infos
 from fusion_gym.validation import refusal
 
 # Groups of runs whose first episodes have different lengths.
@@ -100,7 +102,7 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         self.batch.reset(stagger=self.stagger, groups=_GROUPS)
 
     def _finish(
-        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[dict[str, Any]]
+        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[Infos]
     ) -> None:
         super()._finish(runs, lengths, infos)
         self._observed = None
@@ -135,7 +137,7 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
 
 
 def reference_estimator(
-    env_id: str, options: dict[str, Any], memory_filter: str | None = None
+    env_id: str, options: Options, memory_filter: str | None = None
 ) -> Estimator[Any]:
     """Return the estimator of an environment that processes every measurement.
 

@@ -14,7 +14,8 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
-from fusion_gym.envs.vector import refuse_vector_reward
+from fusion_gym.entries import State
+from fusion_gym.envs.vector import Infos, refuse_vector_reward
 from fusion_gym.envs.views import make_view
 
 
@@ -128,7 +129,7 @@ class FusionSB3VecEnv(VecEnv):
         request_count, granted = np.count_nonzero(requests), np.count_nonzero(outcome.granted)
         self.requests = (self.requests[0] + int(request_count), self.requests[1] + int(granted))
         done = outcome.ended
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos: list[Infos] = [{} for _ in range(self.num_envs)]
         if done.any():
             self._finish(np.flatnonzero(done), lengths, infos)
         reward = (self._reward(outcome) * scale).astype(np.float32)
@@ -136,7 +137,7 @@ class FusionSB3VecEnv(VecEnv):
         self.seconds += time.perf_counter() - began
         return result
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> State:
         """Return the state of all runs for :meth:`restore`, valid until the next step."""
         return {
             "batch": self.batch.snapshot(),
@@ -145,7 +146,7 @@ class FusionSB3VecEnv(VecEnv):
             "totals": self.totals,
         }
 
-    def restore(self, snapshot: dict[str, Any]) -> None:
+    def restore(self, snapshot: State) -> None:
         """Set all runs to a :meth:`snapshot` of an environment of the same task."""
         self.batch.restore(snapshot["batch"])
         self._returns = snapshot["returns"]
@@ -153,7 +154,7 @@ class FusionSB3VecEnv(VecEnv):
         self.totals = snapshot["totals"]
 
     def _finish(
-        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[dict[str, Any]]
+        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[Infos]
     ) -> None:
         """Write the infos of finished runs and begin their next episodes."""
         final = self._observe()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Arguments
 from fusion_gym.envs.drawing import Film, Frame, Window
 from fusion_gym.envs.vector import (
     FRAMES_PER_SECOND,
@@ -75,7 +76,7 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
             self.reward_space = reward_space()
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: Arguments | None = None
     ) -> tuple[NDArray[np.float32], Infos]:
         """Begin a new episode.
 

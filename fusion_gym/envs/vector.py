@@ -15,12 +15,13 @@ from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Arguments
 from fusion_gym.envs.drawing import Film, Frame
 from fusion_gym.envs.members import Members
 from fusion_gym.envs.registration import FusionSpec
 from fusion_gym.envs.views import SchedulerView
 
-Infos = dict[str, Any]
+Infos = Arguments
 RENDER_MODES = ("rgb_array", "human")
 FRAMES_PER_SECOND = 10
 
@@ -109,7 +110,7 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        options: Arguments | None = None,
     ) -> tuple[NDArray[np.float32], Infos]:
         """Begin new episodes in all runs, or in the runs of ``options["reset_mask"]``.
 
@@ -162,7 +163,7 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         if self._film is not None:
             self._film.begin(np.flatnonzero(runs))
 
-    def _reset_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
+    def _reset_mask(self, options: Arguments | None) -> NDArray[np.bool_]:
         validation.reset_options(options, ["reset_mask"])
         if not options or "reset_mask" not in options:
             return self._everyone

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import minimize
 
+from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import LEVEL, RESAMPLES, Interval
@@ -27,7 +29,7 @@ METHODS = {  # name: filter, and whether every sensor has its own threshold
     "silence used, one a sensor": ("truncated", True),
     "centralised": ("joint", False),
 }
-_SEED, _EPISODES, _TRIALS = 700_000_000, 32, 150
+_EPISODES, _TRIALS = 32, 150
 _FAR, _NEAR, _CLOSE = 7.0, 1.5, 0.02  # reaches and tolerance of the logarithm of a common scale
 _QUIET, _BUSY = 0.6, 0.8  # changes of logarithms where one sensor speaks for the others
 _REACH = 3.0  # of the logarithm of a sensor's threshold, from the common scale
@@ -128,7 +130,7 @@ def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
     ]
 
 
-def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[dict[str, Any], str]:
+def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[Options, str]:
     """Return the options and the text of a method's rule."""
     if name == "centralised":
         return {}, f"value_of_information:threshold={float(sizes[0])!r},at_most=1"
@@ -176,7 +178,7 @@ def simulate_sizes(study: FieldStudy, name: str, sizes: Array) -> tuple[float, f
     """Return error and rate in simulation, on the tuning episodes."""
     options, rule = rule_of(study, name, sizes)
     task = study.task(METHODS[name][0], study.source, **options)
-    results = run_episodes(task, make_policy(rule, task), _EPISODES, _SEED)
+    results = run_episodes(task, make_policy(rule, task), _EPISODES, seeds.FIELD.start)
     return float(results.error_cost.mean()), float(results.rate.mean())
 
 

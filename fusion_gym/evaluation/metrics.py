@@ -7,6 +7,7 @@ import numpy as np
 
 from fusion_gym.arrays import Array
 from fusion_gym.docstrings import table
+from fusion_gym.entries import Plain
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.validation import ConfigurationError
@@ -64,7 +65,7 @@ METRICS = {
 }  # fmt: skip
 
 
-def summarise(results: EpisodeResults) -> dict[str, Any]:
+def summarise(results: EpisodeResults) -> Plain:
     """Return every metric of one policy, as in the JSON of an evaluation.
 
     Args:

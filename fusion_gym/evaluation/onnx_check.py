@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fusion_gym import seeds
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
@@ -19,7 +20,6 @@ from fusion_gym.policies.onnx_graph import DecisionGraph
 
 OBSERVATIONS = 10_000
 TOLERANCE = 1e-4  # of numbers, relative to 1 + their size; float32 leaves about 1e-6
-_SEED = 700_000_000  # of the first episode; no training, tuning or test uses it
 _CALLS, _WARM = 5000, 200  # measured calls, and calls before them
 
 Values = dict[str, NDArray[Any]]
@@ -69,7 +69,7 @@ def onnx_agreement(
     path: Path,
     task: Task,
     observations: int = OBSERVATIONS,
-    seed: int = _SEED,
+    seed: int = seeds.EXPORT.start,
 ) -> Agreement:
     """Compare the ONNX file at ``path`` with its agent in whole episodes.
 

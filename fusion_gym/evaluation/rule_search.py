@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fusion_gym import validation
+from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced, run_several
@@ -130,7 +130,7 @@ class RuleSearch:
     generations: int = 30
     population: int = 12
     episodes: tuple[int, int] = (16, 96)
-    seed: int = 1_000_000_000
+    seed: int = seeds.TRAINING.start
 
     def __post_init__(self) -> None:
         validation.positive("prices", self.prices, (len(self.prices),))

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from fusion_gym.entries import Plain
 from fusion_gym.validation import ConfigurationError, read_text
 
 _PARTIAL = re.compile(r"\.\d+\.part(\.\w+)?$")  # with the id of the writing process
@@ -63,7 +64,7 @@ def write(path: Path | None, report: Mapping[str, Any]) -> None:
         write_text(path, json.dumps(report, indent=1) + "\n")
 
 
-def read_json(path: Path, name: str) -> dict[str, Any]:
+def read_json(path: Path, name: str) -> Plain:
     """Return the object in a JSON file; ``name`` is the file's name in error messages."""
     text = read_text(name, path)
     try:

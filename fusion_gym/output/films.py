@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from fusion_gym.entries import Arguments
 from fusion_gym.envs.drawing import Frame
 from fusion_gym.output.files import replacing
 
@@ -19,7 +20,7 @@ def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:
 
     writer: Any
     gif = path.suffix.lower() in ("", ".gif")
-    settings: dict[str, Any] = {"fps": fps, "macro_block_size": 2}
+    settings: Arguments = {"fps": fps, "macro_block_size": 2}
     if gif:  # 64 colours suffice for lines; only changed pixels are written
         settings = {"duration": 1000 / fps, "loop": 0, "palettesize": 64, "subrectangles": True}
     with replacing(path) as unfinished:

@@ -9,6 +9,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from fusion_gym.entries import Plain
 from fusion_gym.output.files import remove_partials
 from fusion_gym.validation import ConfigurationError
 
@@ -72,9 +73,9 @@ class _Absent:
 _ABSENT = _Absent()
 
 
-def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+def _flat(values: Mapping[str, Any], above: str = "") -> Plain:
     """Return nested values by their dotted names."""
-    result: dict[str, Any] = {}
+    result: Plain = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
             result |= _flat(value, f"{above}{key}.")

@@ -33,12 +33,6 @@ plt.rcParams.update(
         "text.parse_math": False,  # users' labels are text
     }
 )
-LARGE: Any = {
-    "font.size": 15,
-    "axes.titlesize": 15,
-    "legend.fontsize": 14,
-    "figure.dpi": 100,
-}  # readable at half width
 # Figures of pages: readable at half their width, with mathematics in their labels.
 READABLE: Any = {
     "text.parse_math": True,

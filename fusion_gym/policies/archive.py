@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from fusion_gym.entries import Plain
 from fusion_gym.validation import ConfigurationError
 
 LARGEST = 256 * 2**20  # bytes of a part, and of all weights
@@ -35,7 +36,7 @@ class NeedsTrust(ConfigurationError):
     """A file that plain JSON and weights cannot restore; only its own code could load it."""
 
 
-def read_plain(file: Path) -> dict[str, Any]:
+def read_plain(file: Path) -> Plain:
     """Return the archive's ``data``, with pickled entries as text."""
     content = read_part(file, "data")
     try:

@@ -25,6 +25,7 @@ from stable_baselines3.dqn.policies import DQNPolicy
 from fusion_gym import validation
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Plain
 from fusion_gym.envs.views import make_view
 from fusion_gym.policies.archive import NeedsTrust
 from fusion_gym.policies.network import NetworkShape
@@ -142,7 +143,7 @@ class Blueprint:
         )
 
 
-def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> dict[str, Any]:
+def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> Plain:
     """Return a model's card, shorter and without a format if weights cannot rebuild its policy."""
     view = make_view(task, local)
     entries = {
@@ -203,12 +204,12 @@ def _inferred(data: Mapping[str, Any]) -> Blueprint:
     return Blueprint(algorithm, names[0], f"{kind}({space.get('n')}{start})")
 
 
-def _entry(data: Mapping[str, Any]) -> dict[str, Any]:
+def _entry(data: Mapping[str, Any]) -> Plain:
     """Return the card in an archive's data, empty if there is none."""
     return _table(data, ENTRY) if ENTRY in data else {}
 
 
-def _table(data: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _table(data: Mapping[str, Any], key: str) -> Plain:
     result = data.get(key)
     if not isinstance(result, dict):
         raise ConfigurationError(f"it is not a Stable-Baselines3 model (its {key} is not a table)")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from fusion_gym.entries import Arguments, Plain
 from fusion_gym.policies.archive import NeedsTrust
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -55,17 +56,17 @@ class NetworkShape:
         values, has_memory = "q" in self.hidden, self.memory is not None
         return (values, has_memory) == (algorithm == "dqn", algorithm == "recurrent_ppo")
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> Plain:
         """Return the sizes as JSON."""
-        entries: dict[str, Any] = {head: list(sizes) for head, sizes in self.hidden.items()}
+        entries: Plain = {head: list(sizes) for head, sizes in self.hidden.items()}
         return entries | ({"memory": vars(self.memory).copy()} if self.memory else {})
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self) -> Arguments:
         """Return the arguments of Stable-Baselines3's policy class."""
         if "q" in self.hidden:
             return {"net_arch": list(self.hidden["q"])}
         sizes = {head: list(sizes) for head, sizes in self.hidden.items()}
-        result: dict[str, Any] = {"net_arch": sizes, "ortho_init": False}
+        result: Arguments = {"net_arch": sizes, "ortho_init": False}
         if self.memory:
             result |= {
                 "lstm_hidden_size": self.memory.size,

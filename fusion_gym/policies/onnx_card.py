@@ -13,6 +13,7 @@ import numpy as np
 from fusion_gym.core.knowledge import MEANING, Block, numbered
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import plain_options
+from fusion_gym.entries import Plain
 from fusion_gym.envs.views import SensorView
 from fusion_gym.policies.card import algorithm_name
 from fusion_gym.policies.model import ModelPolicy
@@ -84,12 +85,12 @@ def layout_version(environment: str, names: list[str]) -> str:
     return f"{environment}:{digest[:16]}"
 
 
-def _ports(shapes: Shapes) -> dict[str, Any]:
+def _ports(shapes: Shapes) -> Plain:
     rows = ((n, list(shape), _TYPES.get(n, "float32")) for n, shape in shapes.items())
     return {n: {"shape": shape, "type": kind, "meaning": _MEANINGS[n]} for n, shape, kind in rows}
 
 
-def _block(block: Block, local: bool) -> dict[str, Any]:
+def _block(block: Block, local: bool) -> Plain:
     """Return a block of entries with the ``labels`` of its axes and its bounds."""
     return {
         "name": block.name,

@@ -17,6 +17,7 @@ import numpy as np
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import KNOWLEDGE, SignalError
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Arguments
 from fusion_gym.importing import TRUST, import_named
 from fusion_gym.policies.base import Policy, guard, owner_of
 from fusion_gym.policies.settings import parse_settings
@@ -189,11 +190,11 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     return policy
 
 
-def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> Policy:
+def _make(spec: str, defaults: dict[str, Arguments], context: Context) -> Policy:
     name, row, text = _parse_policy(spec)
     maker = _maker(row)
     known = _parameters(name, maker)
-    arguments: dict[str, Any] = {}
+    arguments: Arguments = {}
     if row.kind == "agent":
         key, (first, *entries) = next(iter(known)), text.split(",")
         arguments[key] = first.removeprefix(f"{key}=")

@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import Iterable
 from typing import Any
 
+from fusion_gym.entries import Arguments
 from fusion_gym.validation import ConfigurationError
 
 
@@ -24,9 +25,9 @@ def parse_value(text: str) -> Any:
     return text
 
 
-def parse_settings(kind: str, entries: Iterable[str]) -> dict[str, Any]:
+def parse_settings(kind: str, entries: Iterable[str]) -> Arguments:
     """Return ``["key=value", …]`` as a dictionary, with :func:`parse_value`."""
-    result: dict[str, Any] = {}
+    result: Arguments = {}
     for entry in entries:
         key, equals, value = entry.partition("=")
         key = key.strip()

@@ -13,6 +13,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from statsmodels.tsa.deterministic import CalendarFourier, DeterministicProcess
 
 from fusion_gym.arrays import Array
+from fusion_gym.entries import Options
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.recordings.recording import Recording
 from fusion_gym.validation import integer, number
@@ -73,7 +74,7 @@ class FittedPlant:
         return tuple(changes[: len(self.names)].tolist())
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Options:
         """The options of LinearFusion; an error of a standard deviation costs 1 / channels."""
         count, size = len(self.names), len(self.transition)
         weights = np.zeros(size)

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from fusion_gym.docstrings import table
+from fusion_gym.entries import Arguments
 from fusion_gym.importing import import_named
 from fusion_gym.training.checked import Positive, Rate, Several, Share, Strict, Weight
 from fusion_gym.validation import choice
@@ -38,7 +39,7 @@ class AlgorithmConfig(Strict):
     gamma: Share = 0.97
     network: NetworkConfig = NetworkConfig()
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self) -> Arguments:
         """Return the arguments of the algorithm's class."""
         import torch
         from stable_baselines3.common.utils import LinearSchedule
@@ -96,7 +97,7 @@ class RecurrentPPOConfig(PPOConfig):
 
     memory: Positive = 64
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self) -> Arguments:
         """Return the arguments of the algorithm's class; ``memory`` is the size of the LSTM."""
         result = super().arguments()
         result["policy_kwargs"]["lstm_hidden_size"] = result.pop("memory")

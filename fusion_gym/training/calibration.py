@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_priced
@@ -34,7 +35,6 @@ THRESHOLDS = -2.4, -0.8, -0.3, -0.1, 0.1, 0.3, 0.8
 EPISODES = 16, 400  # of all candidates, and of the best, the rule and the agents
 BEST = 4  # candidates of the last round
 ERRORS = 2.0  # standard errors by which another candidate must be cheaper than the rule
-SEED = 800_000_000  # of the first tuning episode
 _LANES = 4096  # runs in one batch
 _LEAST = 1e-6  # slope
 _WORST = 1e30  # the cost of an error that is no number
@@ -98,10 +98,10 @@ def calibrate(
     candidates = [_RULE, *own, *(item for item in grid if item[0] == 0 or item[1] < 1.0)]
     with progress_bar(len(prices), "calibrating", unit="prices") as bar:
         for price in prices:
-            costs = _costs(trial, candidates, price, first, SEED).mean(1)
+            costs = _costs(trial, candidates, price, first, seeds.CALIBRATION.start).mean(1)
             order = [candidates[place] for place in np.argsort(costs, kind="stable")]
             finalists = list(dict.fromkeys([_RULE, *own, *order[: BEST + 1 + len(own)]]))
-            results = _costs(trial, finalists, price, last, SEED + first)
+            results = _costs(trial, finalists, price, last, seeds.CALIBRATION[first])
             rows.append(_choice(price, finalists, results, len(own)))
             bar.update()
     with replacing(output) as partial:
@@ -111,10 +111,11 @@ def calibrate(
 
 def fit_slopes(policy: CalibratedPolicy, prices: Sequence[float], episodes: int) -> list[float]:
     """Return each agent's slope of its logit on z; without one, the ratio of deviations."""
-    seeds, samples = SEED + np.tile(np.arange(episodes), len(prices)), []
-    batch = seeded(policy.task, policy.memory_owner, seeds)
+    start, samples = seeds.CALIBRATION.start, []
+    each = start + np.tile(np.arange(episodes), len(prices))
+    batch = seeded(policy.task, policy.memory_owner, each)
     batch.price = np.repeat(np.array(prices, dtype=np.float64), episodes)
-    for requests in decide(policy.rule, batch, SEED):
+    for requests in decide(policy.rule, batch, start):
         signals = batch.signals()
         logits = (agent.logits(signals) for agent in policy.agents)
         samples.append(np.stack([policy.rule.log_ratio(signals), *logits]))
@@ -150,7 +151,7 @@ def _costs(
     for first in range(0, len(candidates), size):
         group = np.repeat(np.array(candidates[first : first + size]), episodes, axis=0)
         trial.candidates = group[:, 0].astype(np.int64), group[:, 1], group[:, 2]
-        seeds, prices = seed + np.arange(len(group)) % episodes, np.full(len(group), price)
-        parts.append(run_priced(trial.task, trial, seeds, prices).cost(price))
+        each, prices = seed + np.arange(len(group)) % episodes, np.full(len(group), price)
+        parts.append(run_priced(trial.task, trial, each, prices).cost(price))
     costs = np.nan_to_num(np.concatenate(parts), nan=_WORST, posinf=_WORST)
     return costs.reshape(len(candidates), episodes)

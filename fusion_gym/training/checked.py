@@ -57,18 +57,13 @@ def config_path(name: str | Path, option: str = "config") -> Path:
 
 def load_checked(kind: type[Model], name: str | Path, option: str = "config") -> Model:
     """Return the checked config of a path or shipped name."""
-    return parse(kind, read_yaml(name, option), str(name), option)
+    return checked(kind, read_yaml(name, option), f"{option} {str(name)!r}")
 
 
 def read_yaml(name: str | Path, option: str = "config") -> Any:
     """Return the content of the config of a path or shipped name."""
     text = validation.read_text(option, config_path(name, option), str(name))
     return parsed(text, f"{option} {str(name)!r}")
-
-
-def parse(kind: type[Model], content: Any, source: str, option: str = "config") -> Model:
-    """Return the content as a checked model; an error names ``source`` and the first field."""
-    return checked(kind, content, f"{option} {source!r}")
 
 
 def checked(shape: type[Shape], content: Any, source: str) -> Shape:

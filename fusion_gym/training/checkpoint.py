@@ -13,12 +13,13 @@ import random
 import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from fusion_gym.entries import Plain, State
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.output.files import replacing
 from fusion_gym.policies.archive import DAMAGE
@@ -29,6 +30,19 @@ DAMAGED = (*DAMAGE, KeyError, TypeError, ValueError)  # errors from a damaged ch
 _JOURNAL, _STATE, _BEST = "journal.json", "state.pkl", "best_model.zip"
 # Attributes that Stable-Baselines3 does not save: replay buffer and recurrent memory.
 _LEFT_OUT = ("replay_buffer", "_last_lstm_states")
+
+
+ValidationRecord = TypedDict(
+    "ValidationRecord",
+    {
+        "timesteps": int,
+        "return": float,
+        "mse": float,
+        "rate": float,
+        "relative_cost": float,
+        "prices": list[dict[str, float]],
+    },
+)
 
 
 @dataclass
@@ -43,8 +57,8 @@ class Journal:
         best: file of the best model.
     """
 
-    inputs: dict[str, Any]
-    records: list[dict[str, Any]] = field(default_factory=list)
+    inputs: Plain
+    records: list[ValidationRecord] = field(default_factory=list)
     seconds: dict[str, float] = field(
         default_factory=lambda: dict.fromkeys(
             ("environment", "policy", "update", "validation"), 0.0
@@ -102,7 +116,7 @@ def restore(path: Path, kind: type[BaseAlgorithm], env: FusionSB3VecEnv) -> Base
     return model
 
 
-def _state(model: BaseAlgorithm, env: FusionSB3VecEnv) -> dict[str, Any]:
+def _state(model: BaseAlgorithm, env: FusionSB3VecEnv) -> State:
     """Return the state of a training that Stable-Baselines3 does not save."""
     return {
         "env": env.snapshot(),

@@ -8,9 +8,11 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
+from fusion_gym import seeds
+from fusion_gym.entries import Options, Plain
 from fusion_gym.envs.registration import open_options
 from fusion_gym.training.algorithms import AnyAlgorithm
-from fusion_gym.training.checked import Positive, Share, Strict, parse
+from fusion_gym.training.checked import Positive, Share, Strict, checked
 
 
 class EnvironmentConfig(Strict):
@@ -21,12 +23,12 @@ class EnvironmentConfig(Strict):
     """
 
     id: str
-    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+    options: Options = pydantic.Field(default_factory=dict)
     local: bool = False
 
     @pydantic.field_validator("options")
     @classmethod
-    def _opened(cls, options: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
+    def _opened(cls, options: Options, info: pydantic.ValidationInfo) -> Options:
         return open_options(info.data["id"], options) if "id" in info.data else options
 
 
@@ -59,7 +61,7 @@ class ValidationConfig(Strict):
 
     every: Positive = 500_000
     episodes: Positive = 256
-    seed: int = pydantic.Field(default=500_000_000, ge=0)
+    seed: int = pydantic.Field(default=seeds.VALIDATION.start, ge=0)
 
 
 class CalibrationConfig(Strict):
@@ -103,7 +105,7 @@ class Experiment(Strict):
     calibration: CalibrationConfig | None = CalibrationConfig()
     output: str = pydantic.Field(min_length=1, pattern=r"^[^\n\t]+$")
 
-    def inputs(self) -> dict[str, Any]:
+    def inputs(self) -> Plain:
         """Return the inputs that determine the results, without length, folder and threads."""
         return self.model_dump(
             mode="json",
@@ -139,4 +141,4 @@ class Experiment(Strict):
         plain["training"] |= {key: value for key, value in training.items() if value is not None}
         if training.get("timesteps") is not None:
             plain["training"]["many_sensors"] = None
-        return parse(Experiment, plain, "command line")
+        return checked(Experiment, plain, "config 'command line'")

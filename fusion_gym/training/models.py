@@ -7,9 +7,11 @@ import torch
 from gymnasium.spaces import Discrete, MultiBinary
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Arguments
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_estimator
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SensorView
@@ -24,7 +26,6 @@ from fusion_gym.validation import ConfigurationError, refusal
 
 # Constants of the warning of a cross term:
 _EPISODES = 150  # of each of two policies: a second or two in the slowest environment
-_SEED = 700_000_000  # far from the seeds of trainings, validations, tuning and tests
 _LEVEL = 0.99  # of the intervals together: one false warning in a hundred settings
 
 
@@ -36,7 +37,7 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
         reason = "set the environment's option action: discrete"
         raise forbidden("action", task.action, reason, f"with algorithm {name!r}")
     training, where = experiment.training, experiment.environment
-    runs: dict[str, Any] = {
+    runs: Arguments = {
         "num_envs": training.num_envs,
         "stagger": True,
         "local": local,
@@ -127,7 +128,8 @@ def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
     assert reference is not None  # present in the environment of such a training
     rate = getattr(experiment.algorithm, "initial_rate", None) or 0.5
     policies = {name: make_policy(name, task) for name in usual_policies(task, rate)}
-    name, terms = worst(cross_terms(task, reference, policies, _EPISODES, _SEED, _LEVEL))
+    seed = seeds.CROSS_TERM.start
+    name, terms = worst(cross_terms(task, reference, policies, _EPISODES, seed, _LEVEL))
     if not terms.compatible:
         remark(
             f"warning: training.error = 'mismatch' leaves out a cross term of {terms.text} of the "

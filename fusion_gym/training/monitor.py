@@ -10,7 +10,6 @@ import threading
 import time
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.progress import Bar
 from fusion_gym.training import checkpoint
 from fusion_gym.training.callback import Callback
-from fusion_gym.training.checkpoint import Journal
+from fusion_gym.training.checkpoint import Journal, ValidationRecord
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.diagnosis import (
     PriceRecord,
@@ -149,7 +148,7 @@ class Progress(Callback):
         scale = self.task.reward.price.scale(
             np.array(self.prices), self.experiment.training.price_exponent
         )
-        record: dict[str, Any] = {
+        record: ValidationRecord = {
             "timesteps": self.num_timesteps,
             "return": -self.task.horizon * float((scale * costs).mean()),
             "mse": means.mse,
@@ -165,8 +164,9 @@ class Progress(Callback):
             self._write_best(self.journal.best)
         self.journal.records.append(record)
         self._write_records()
-        for key in ("return", "mse", "rate", "relative_cost"):
-            self.logger.record(f"validation/{key}", record[key])
+        for key, number in record.items():
+            if key not in ("timesteps", "prices"):
+                self.logger.record(f"validation/{key}", number)
         self.logger.record("validation/cpu_seconds", self.journal.cpu_seconds)
         for row in rows:
             for key, value in row._asdict().items():
@@ -205,7 +205,7 @@ class Progress(Callback):
         )
 
 
-def log_line(record: dict[str, Any]) -> str:
+def log_line(record: ValidationRecord) -> str:
     """Return a validation in a few words."""
     return f"MSE {record['mse']:.4f}, rate {record['rate']:.3f}"
 

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import torch
 import yaml
@@ -11,7 +11,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 
+from fusion_gym import seeds
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Plain
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.importing import trust_files
@@ -28,8 +30,16 @@ from fusion_gym.training.models import make_env, make_model, warn_of_cross_term
 from fusion_gym.training.monitor import Interrupt, Progress, Stop
 from fusion_gym.validation import ConfigurationError
 
-# Training seeds lie far from the validation's and from the small numbers that tests use.
-TRAINING_SEEDS = 1_000_000_000
+
+class Summary(TypedDict):
+    """The summary of a training: ``seconds`` by activity, and a hash of its inputs."""
+
+    timesteps: int
+    finished: bool
+    steps_per_second: int
+    seconds: dict[str, float]
+    best_validation: Plain | None
+    inputs: str
 
 
 def holds_training(folder: Path) -> bool:
@@ -72,7 +82,7 @@ def train(
     resume: bool = False,
     quiet: bool = False,
     callbacks: Sequence[BaseCallback] = (),
-) -> dict[str, Any]:
+) -> Summary:
     """Run the training and return its summary.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (over
@@ -113,7 +123,7 @@ def train(
         journal = earlier(experiment, folder, resume)
         if journal is None:
             journal = Journal(experiment.inputs())
-            env.seed(TRAINING_SEEDS + 10_000_019 * experiment.training.seed)
+            env.seed(seeds.TRAINING[seeds.STRIDE * experiment.training.seed])
             if experiment.training.error == "mismatch" and not quiet:
                 warn_of_cross_term(experiment, env)
         else:
@@ -122,13 +132,13 @@ def train(
             writing(("checkpoints, models and validations", folder))
         plain = experiment.model_dump(mode="json")
         write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
-        return _learn(experiment, folder, model, env, scored, journal, quiet, callbacks)
+        return _learn(experiment, folder, model, scored, journal, quiet, callbacks)
 
 
 def _learn(
-    experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
+    experiment: Experiment, folder: Path, model: BaseAlgorithm, scored: Task,
     journal: Journal, quiet: bool, others: Sequence[BaseCallback],
-) -> dict[str, Any]:  # fmt: skip
+) -> Summary:  # fmt: skip
     """Train the remaining steps, write the results and return the summary."""
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
     total, begun, began = experiment.training.timesteps, model.num_timesteps, time.perf_counter()
@@ -167,12 +177,12 @@ def _learn(
                 with quietly(quiet):
                     _calibrate(folder, scored, progress.prices, experiment.calibration.episodes)
     best = min(journal.records, key=lambda record: record["relative_cost"], default=None)
-    summary = {
+    summary: Summary = {
         "timesteps": model.num_timesteps,
         "finished": finished,
         "steps_per_second": round(model.num_timesteps / (sum(journal.seconds.values()) or 1.0)),
         "seconds": {key: round(value, 2) for key, value in journal.seconds.items()},
-        "best_validation": best and {key: best[key] for key in best if key != "prices"},
+        "best_validation": best and {key: value for key, value in best.items() if key != "prices"},
         "inputs": fingerprint(journal.inputs),
     }
     write(folder / "summary.json", summary)
@@ -195,7 +205,7 @@ def _calibrate(
     calibrate(task, [file], prices, episodes, folder / "calibrated_model.zip")
 
 
-def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
+def describe(summary: Summary, folder: Path, elapsed: float) -> str:
     """Return the summary of a training as text in a few lines."""
     lines = [
         f"{'finished' if summary['finished'] else 'interrupted'} after {summary['timesteps']:,} "

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pydantic
 
 from fusion_gym.core.reward import Price
+from fusion_gym.entries import Options
 from fusion_gym.training.checked import Strict
 
 
@@ -52,7 +51,7 @@ class ComparisonRow(Strict):
     label: str
     policy: str
     environment: str | None = None
-    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+    options: Options = pydantic.Field(default_factory=dict)
 
 
 class SweepSettings(Strict):

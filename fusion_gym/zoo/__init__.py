@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden
 from fusion_gym.validation import choice
 
@@ -48,7 +49,7 @@ def model_path(name: str) -> str:
     return str(path)
 
 
-def card(name: str) -> dict[str, Any]:
+def card(name: str) -> Plain:
     """Return an agent's card: environment, options, training and test results.
 
     Args:
@@ -63,7 +64,7 @@ def card(name: str) -> dict[str, Any]:
         'fusion_gym/TobitOscillator-v1'
     """
     path = _folder().joinpath(f"{choice('zoo', name, names())}.json")
-    content: dict[str, Any] = json.loads(path.read_text())
+    content: Plain = json.loads(path.read_text())
     return content
 
 

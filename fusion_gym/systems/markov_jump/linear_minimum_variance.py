@@ -102,17 +102,18 @@ class AugmentedModel:
         start, pi = plant.initial_mean[:, 0], plant.initial_probabilities
         second = plant.initial_covariance[..., 0] + np.outer(start, start)
         moments = pi[:, None, None] * second
+        now = _diagonal_blocks(moments)
         mean = self.initial_mean
         driven = gamma @ noise @ gamma.swapaxes(1, 2)
         while True:
-            following = np.tensordot(
-                chain.T, phi @ moments @ phi.swapaxes(1, 2) + pi[:, None, None] * driven, 1
-            )
-            entry = np.tensordot(chain.T, pi[:, None, None] * gamma, 1).reshape(self.size, -1)
-            now, later = _diagonal_blocks(moments), _diagonal_blocks(following)
+            second = phi @ moments @ phi.swapaxes(1, 2) + pi[:, None, None] * driven
+            following = (chain.T @ second.reshape(plant.modes, -1)).reshape(second.shape)
+            entry = chain.T @ (pi[:, None, None] * gamma).reshape(plant.modes, -1)
+            entry = entry.reshape(self.size, -1)
+            later = _diagonal_blocks(following)
             carried = self.transition @ now @ self.transition.T + entry @ noise @ entry.T
             yield AugmentedStep(pi, now, mean, entry, later - carried)
-            moments, pi, mean = following, pi @ chain, self.transition @ mean
+            moments, now, pi, mean = following, later, pi @ chain, self.transition @ mean
 
     def state_moments(self, last: int) -> tuple[Array, Array]:
         """Return E x and the diagonal of E x xᵀ at k = 0..last, both (last + 1, n)."""
