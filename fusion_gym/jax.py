@@ -279,7 +279,8 @@ class FunctionalEnv:
         price: Any = task.reward.price.draw(uniform)
         if params is not None and params.price is not None:
             price = params.price
-        state = advance(task, start_of(task, start)[0], noise, steps)
+        first = jax.tree.map(jnp.asarray, start_of(task, start)[0])
+        state = advance(task, first, noise, steps)
         prices = cast(Any, jnp.broadcast_to(price, steps.shape))
         position = Position(state, prices, steps, steps + task.horizon)
         position = jax.tree.map(jnp.asarray, position)

@@ -166,9 +166,10 @@ def dot(u: FloatArray, v: FloatArray) -> FloatArray:
     """Return the inner product ``u^T v``, ``(..., N)``, of two vectors ``(..., n, N)``."""
     length = u.shape[-2]
     _require_equal_lengths("dot", length, v.shape[-2])
-    result: FloatArray = u[..., 0, :] * v[..., 0, :]
+    product = u * v
+    result: FloatArray = product[..., 0, :]
     for k in range(1, length):
-        result += u[..., k, :] * v[..., k, :]
+        result = result + product[..., k, :]
     return result
 
 

@@ -134,7 +134,7 @@ def in_runs(
     if xp is np:
         if mask.any():
             runs = np.flatnonzero(mask.reshape(-1, mask.shape[-1]).any(0))
-            parts = (part if part.shape[-1] == 1 else part[..., runs] for part in arguments)
+            parts = (part if part.shape[-1] == 1 else part.take(runs, -1) for part in arguments)
             for result, value in zip(results, function(*parts), strict=True):
                 result[..., runs] = value
         return results
@@ -146,6 +146,57 @@ def in_runs(
 
     selected = mask.reshape(-1, mask.shape[-1]).any(0)
     return lax.cond(selected.any(), every, tuple, tuple(results))
+
+
+def runs_of(mask: Any) -> Any:
+    """Return the numbers of the runs of ``mask`` (N,), or the mask itself under JAX."""
+    return np.flatnonzero(mask) if type(mask) is _NDARRAY else mask
+
+
+def at_runs(array: Any, runs: Any) -> Any:
+    """Return the part of :func:`runs_of` with a contiguous batch axis; under JAX the whole."""
+    some = type(runs) is _NDARRAY and type(array) is _NDARRAY
+    return array.take(runs, axis=-1) if some else array
+
+
+def put_runs(array: Any, runs: Any, values: Any) -> Any:
+    """Return ``array`` with the ``values`` of :func:`at_runs`; NumPy's is changed in place."""
+    if isinstance(runs, slice):
+        return values
+    if type(runs) is _NDARRAY:
+        array[..., runs] = values
+        return array
+    return namespace(values, array).where(runs, values, array)
+
+
+def repeat(step: Callable[..., tuple[Any, Any]], state: Any, most: int) -> Any:
+    """Return the state after ``step``, at most ``most`` times.
+
+    Args:
+        step: From a state, a tuple of arrays, to whether it goes on and the next state.
+        state: The first state; NumPy's arrays may be changed in place.
+        most: Largest number of steps.
+    """
+    if namespace(*state[:2]) is np:
+        for _ in range(most):
+            goes_on, state = step(state)
+            if not goes_on:
+                break
+        return state
+    from jax import lax
+
+    def next_one(carry: Any) -> Any:
+        return carry[0] + 1, *step(carry[2])
+
+    first = 0, namespace(*state[:2]).asarray(True), state
+    return lax.while_loop(lambda carry: carry[1] & (carry[0] < most), next_one, first)[2]
+
+
+def take(table: Any, place: Any) -> Any:
+    """Return the entries (…, N) of a table (…, T) at the places (N,)."""
+    if type(place) is _NDARRAY:
+        return table.take(place, -1)
+    return namespace(place).take(table, place, axis=-1)
 
 
 def active_rows(mask: Any) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from test_namespace import TASKS
+from test_namespace import SLOW_TASKS, TASKS
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -68,7 +68,10 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
         assert bool(result.ended[0])
 
 
-@pytest.mark.parametrize(("name", "options"), TASKS)
+SLOWLY = [pytest.param(*task, marks=pytest.mark.slow) for task in SLOW_TASKS]
+
+
+@pytest.mark.parametrize(("name", "options"), [*TASKS, *SLOWLY])
 def test_backend_equals_numpy_and_itself_in_any_batch(name: str, options: dict[str, Any]) -> None:
     options = {"horizon": HORIZON, "vectorization_mode": "vector_entry_point"} | options
     envs = [
@@ -201,7 +204,6 @@ def test_parameters_may_be_mapped() -> None:
 @pytest.mark.parametrize(
     ("name", "options", "field"),
     [
-        ("MarkovJumpTracking-v1", {}, "system"),
         ("TobitOscillator-v1", {"memory": True}, "memory"),
         ("TobitOscillator-v1", {"fusion": "ci"}, "fusion"),
         ("LinearFusion-v2", {"true_process_noise": 2.0}, "true_process_noise"),

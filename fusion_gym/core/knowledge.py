@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace
 
 Knowledge = Literal[
     "clock", "centre", "own", "scheduler", "own_memory", "scheduler_memory"
@@ -263,8 +264,9 @@ def log_deviation(covariance: Array, reference: Array) -> Array:
         reference: Variances (n,), zero for a state that is always known.
     """
     possible = np.where(reference > 0.0, reference, np.inf)
+    xp, variance = namespace(covariance), linalg.diagonal(covariance)
     with np.errstate(divide="ignore"):
-        return 0.5 * np.log(np.maximum(linalg.diagonal(covariance), 0.0) / possible[:, None])
+        return 0.5 * xp.log(xp.maximum(variance, 0.0) / possible[:, None])
 
 
 def numbered(count: int) -> tuple[str, ...]:

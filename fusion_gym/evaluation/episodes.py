@@ -14,7 +14,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.policy_batch import Together, seeded
-from fusion_gym.fusion.intersection import orthonormalise
+from fusion_gym.fusion.diagonal import orthonormalise
 from fusion_gym.policies.base import Policy, decide, owner_of
 
 _EPISODE_MEANS = ("mse", "error_cost", "bound_trace", "nees", "tokens", "denied", "diverged")

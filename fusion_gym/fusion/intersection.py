@@ -1,168 +1,26 @@
 """Covariance intersection and its inverse form, of two estimates and of several in turn.
 
-In coordinates that make both covariances diagonal (:func:`diagonalise`) the rules for two estimates
-are scalar, and their trace is a convex sum with the minimum :func:`best_weight`.
+In coordinates that make both covariances diagonal (:mod:`fusion_gym.fusion.diagonal`) the rules for
+two estimates are scalar, and their trace is a convex sum with the minimum :func:`best_weight`.
 :mod:`fusion_gym.fusion.several` joins more than two estimates at once.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.fusion.diagonal import DiagonalPair, diagonalise
 from fusion_gym.fusion.rules import Active, Fused, SmallestTrace, own_covariances
+from fusion_gym.namespace import at_runs, namespace, put_runs, repeat, runs_of
 from fusion_gym.validation import refusal
 
-_ORTHOGONAL = 1e-13  # cosine below which two rows count as orthogonal
-_SWEEPS = 30  # largest number of sweeps; sizes up to 6 need fewer than 10
 _HALVINGS = 24  # bisections; the trace is then within 2^-25 of its optimum
-REGULAR = 1e-4  # least share of a state's variance that other states do not explain
-_DEPENDENT = 1e-24  # share of a row's squared norm below which it counts as dependent
 _FLAT = 1e-12  # relative slope below which the weight makes no difference
-
-
-class DiagonalPair(NamedTuple):
-    """Two covariances P_A = V diag(a) Vᵀ and P_B = V diag(b) Vᵀ with a + b = 1.
-
-    Attributes:
-        basis: Vᵀ (n, n, N), with rows of zeros where both variances are zero.
-        inverse: V⁺ (n, n, N).
-        first: a (n, N).
-        second: b (n, N).
-        power: Squared norms c (n, N) of the columns of V, so that V diag(p) Vᵀ has the trace Σ c_j
-            p_j.
-        uncertain: (n, N), whether both variances of a state are positive.
-    """
-
-    basis: Array
-    inverse: Array
-    first: Array
-    second: Array
-    power: Array
-    uncertain: NDArray[np.bool_]
-
-
-@np.errstate(all="ignore")
-def orthonormalise(roots: Array) -> Array:
-    """Return coordinates in which Σ F_i F_iᵀ is the identity.
-
-    The Gram-Schmidt method takes the row with the largest remaining part next.
-
-    Args:
-        roots: F_i (l, n, n, N).
-
-    Returns:
-        Rows (n, (l + 2) n, N) of (W_1, …, W_l, T, Vᵀ) with F_i = V W_i and T V = I, zeros from the
-        rank on.
-    """
-    count, size, _, runs = roots.shape
-    width, lanes = count * size, np.arange(runs)
-    rows = np.empty((size, width + size, runs))
-    rows[:, :width] = roots.swapaxes(0, 1).reshape(size, width, runs)
-    rows[:, width:] = linalg.identity(size)
-    result = np.empty((size, width + 2 * size, runs))
-    whole = linalg.dot(rows[:, :width], rows[:, :width])
-    for k in range(size):
-        square = linalg.dot(rows[:, :width], rows[:, :width])
-        left = np.where(whole == 0.0, 0.0, square / whole)
-        row = left.argmax(0)
-        length = np.sqrt(square[row, lanes])
-        taken = np.take_along_axis(rows, row[None, None], 0)[0] / length
-        taken = np.where(left[row, lanes] <= _DEPENDENT, 0.0, taken)
-        column = linalg.dot(rows[:, :width], taken[:width])
-        rows -= column[:, None] * taken
-        result[k] = np.concatenate((taken, column))
-    return result
-
-
-@np.errstate(all="ignore")
-def diagonalise(
-    covariance_a: Array, covariance_b: Array, metric: Array | None = None
-) -> DiagonalPair:
-    """Return two covariances in common diagonal coordinates.
-
-    With P_A = C Cᵀ, rotations make the rows of G = C⁻¹ chol(P_B) orthogonal: their squared norms
-    are b / a, each with a small relative error. The rotations turn Cᵀ into Vᵀ and C⁻¹ into V⁻¹.
-    Where P_A or P_B is nearly singular, the rows of :func:`orthonormalise` replace G: first the
-    rows of P_A are made orthogonal, then the rows of P_B, because the first do not resolve small b.
-
-    Args:
-        covariance_a: P_A (n, n, N), positive semi-definite.
-        covariance_b: P_B (n, n, N), positive semi-definite.
-        metric: G (n, n, N) of the trace of G P Gᵀ; the identity by default.
-    """
-    pair = np.stack(np.broadcast_arrays(covariance_a, covariance_b))
-    size, factor = len(covariance_a), linalg.cholesky(pair)
-    rows = np.zeros((size, 3 * size, pair.shape[-1]))  # [G, C⁻¹, Cᵀ], rotated together
-    rows[:, :size] = factor[1]
-    rows[:, size : 2 * size] = linalg.identity(size)
-    for k in range(size):
-        rows[k, : 2 * size] /= factor[0, k, k]
-        rows[k + 1 :, : 2 * size] -= factor[0, k + 1 :, k, None] * rows[k, : 2 * size]
-    rows[:, 2 * size :] = linalg.transpose(factor[0])
-    _orthogonalise(rows)
-    ratio = linalg.dot(rows[:, :size], rows[:, :size])
-    unit = np.sqrt(1.0 + ratio)[:, None]
-    inverse, basis = rows[:, size : 2 * size] / unit, rows[:, 2 * size :] * unit
-    variances = np.stack((np.ones_like(ratio), ratio)) / (1.0 + ratio)
-    regular = np.square(linalg.diagonal(factor)) > REGULAR * linalg.diagonal(pair)
-    lanes = np.flatnonzero(~regular.all((0, 1)))
-    if lanes.size:
-        rows = orthonormalise(linalg.root(pair.take(lanes, axis=-1)))
-        _orthogonalise(rows)
-        rows[:, : 2 * size] = np.roll(rows[:, : 2 * size], size, 1)
-        _orthogonalise(rows)
-        other, own, inverse[..., lanes], basis[..., lanes] = np.split(rows, 4, 1)
-        variances[..., lanes] = linalg.dot(own, own), linalg.dot(other, other)
-    weighed = basis if metric is None else linalg.matmul(basis, linalg.transpose(metric))
-    power = linalg.dot(weighed, weighed)
-    uncertain = np.asarray((linalg.diagonal(pair) > 0.0).all(0))
-    return DiagonalPair(basis, inverse, variances[0], variances[1], power, uncertain)
-
-
-def _orthogonalise(rows: Array) -> None:
-    """Rotate rows (n, m, N) until their first n entries are orthogonal (one-sided Jacobi method).
-
-    Runs with orthogonal rows remain unchanged, so that a result does not depend on other runs.
-
-    Args:
-        rows: (n, m, N), changed in place.
-    """
-    size = len(rows)
-    for _ in range(_SWEEPS):
-        rotated = False
-        for first, second in combinations(range(size), 2):
-            rotated |= _rotate(rows[first], rows[second], size)
-        if not rotated:
-            break
-
-
-def _rotate(first: Array, second: Array, size: int) -> bool:
-    """Make the first n entries of two rows (m, N) orthogonal; return False if they all were."""
-    product = linalg.dot(first[:size], second[:size])
-    norm_first = linalg.dot(first[:size], first[:size])
-    norm_second = linalg.dot(second[:size], second[:size])
-    turned = product * product > _ORTHOGONAL**2 * norm_first * norm_second
-    if not turned.any():
-        return False
-    product *= 2.0
-    difference = norm_second - norm_first
-    root = np.sqrt(difference * difference + product * product)
-    tangent = np.zeros_like(product)
-    np.divide(product, difference + np.copysign(root, difference), out=tangent, where=turned)
-    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
-    sine = tangent * cosine
-    old = first.copy()
-    first *= cosine
-    first -= sine * second
-    second *= cosine
-    second += sine * old
-    return True
 
 
 @np.errstate(all="ignore")
@@ -181,36 +39,40 @@ def best_weight(numerator: Array, start: Array, end: Array) -> Array:
     factor = numerator * change
     descent_start = linalg.dot(factor, 1.0 / (start * start))
     descent_end = linalg.dot(factor, 1.0 / (end * end))
-    weight = np.full(numerator.shape[-1], 0.5)
-    step = 0.25
-    for _ in range(_HALVINGS):
+    xp = namespace(numerator, start)
+
+    def halve(state: tuple[Array, float]) -> tuple[bool, tuple[Array, float]]:
+        weight, step = state
         divisor = change * weight
         divisor += start
         divisor *= divisor
-        np.divide(factor, divisor, out=divisor)
-        slope = divisor[0]
-        for row in divisor[1:]:
+        quotient = factor / divisor
+        slope = quotient[0]
+        for row in quotient[1:]:
             slope += row
-        weight += np.copysign(step, slope)
-        step *= 0.5
-    weight[descent_start <= 0.0] = 0.0
-    weight[descent_end >= 0.0] = 1.0
-    steepest = np.maximum(np.abs(descent_start), np.abs(descent_end))
-    weight[steepest <= _FLAT * linalg.dot(numerator, 1.0 / start)] = 0.5
-    return weight
+        weight += xp.copysign(step, slope)
+        return True, (weight, 0.5 * step)
+
+    weight = repeat(halve, (xp.full(numerator.shape[-1], 0.5), 0.25), _HALVINGS)[0]
+    weight = xp.where(descent_start <= 0.0, 0.0, weight)
+    weight = xp.where(descent_end >= 0.0, 1.0, weight)
+    steepest = xp.maximum(xp.abs(descent_start), xp.abs(descent_end))
+    flat = steepest <= _FLAT * linalg.dot(numerator, 1.0 / start)
+    return xp.where(flat, 0.5, weight)
 
 
 def _join(
     mean_a: Array, mean_b: Array, pair: DiagonalPair, fused: Array, share: Array, weight: Array
 ) -> Fused:
     """Return P = V diag(fused) Vᵀ and the mean with L = V diag(share) V⁻¹."""
-    scaled = pair.basis * np.sqrt(fused)[:, None] * pair.uncertain
+    xp = namespace(fused)
+    scaled = pair.basis * xp.sqrt(fused)[:, None] * pair.uncertain
     second = linalg.matmul(linalg.transpose(pair.basis), pair.inverse * share[:, None])
     return Fused(
         mean_a + linalg.matvec(second, mean_b - mean_a),
         linalg.matmul(linalg.transpose(scaled), scaled),
-        lambda: np.stack((linalg.identity(len(share)) - second, second)),
-        np.stack((weight, 1.0 - weight)),
+        lambda: xp.stack((linalg.identity(len(share)) - second, second)),
+        xp.stack((weight, 1.0 - weight)),
     )
 
 
@@ -256,10 +118,11 @@ def _intersect(
     """Return the pair, the best ω, the variances p = a b / (ω b + (1 - ω) a) and b's shares."""
     pair = diagonalise(covariance_a, covariance_b, basis)
     both = pair.first * pair.second
-    start, end = np.where(both > 0.0, pair[2:4], 1.0)
+    xp = namespace(both)
+    start, end = xp.where(both > 0.0, xp.stack(pair[2:4]), 1.0)
     weight = best_weight(pair.power * both, start, end)
     total = weight * end + (1.0 - weight) * start
-    share = np.where(both > 0.0, (1.0 - weight) * start / total, pair.first)
+    share = xp.where(both > 0.0, (1.0 - weight) * start / total, pair.first)
     return pair, weight, both / total, share
 
 
@@ -273,16 +136,16 @@ def best_of_pair(
         selected: (l, N), two estimates per run.
         basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
     """
+    xp = namespace(covariances, selected)
     first = selected.argmax(0)
     second = len(selected) - 1 - selected[::-1].argmax(0)
     a, b = (
-        np.take_along_axis(covariances, which[None, None, None], 0)[0] for which in (first, second)
+        xp.take_along_axis(covariances, which[None, None, None], 0)[0] for which in (first, second)
     )
     pair, weight, fused, _ = _intersect(a, b, basis)
-    scaled = pair.basis * np.sqrt(fused)[:, None]
-    weights = np.zeros(selected.shape)
-    inside = np.arange(selected.shape[-1])
-    weights[first, inside], weights[second, inside] = weight, 1.0 - weight
+    scaled = pair.basis * xp.sqrt(fused)[:, None]
+    place = np.arange(len(selected))[:, None]
+    weights = xp.where(place == first, weight, xp.where(place == second, 1.0 - weight, 0.0))
     return weights, linalg.matmul(linalg.transpose(scaled), scaled)
 
 
@@ -295,7 +158,7 @@ def information_fusion(
 ) -> Fused:
     """Fuse two estimates of independent errors: P = (P_A⁻¹ + P_B⁻¹)⁻¹."""
     pair = diagonalise(covariance_a, covariance_b)
-    weight = np.full(pair.first.shape[-1:], 0.5)
+    weight = namespace(pair.first).full(pair.first.shape[-1:], 0.5)
     return _join(mean_a, mean_b, pair, pair.first * pair.second, pair.first, weight)
 
 
@@ -342,10 +205,11 @@ def inverse_covariance_intersection(
     """
     pair = diagonalise(covariance_a, covariance_b, basis)
     both = pair.first * pair.second
-    end, start = np.where(both > 0.0, np.square(pair[2:4]), 1.0)
+    xp = namespace(both)
+    end, start = xp.where(both > 0.0, xp.square(xp.stack(pair[2:4])), 1.0)
     weight = best_weight(pair.power * both * both, start, end)
     total = weight * end + (1.0 - weight) * start
-    share = np.where(both > 0.0, weight * end / total, pair.first)
+    share = xp.where(both > 0.0, weight * end / total, pair.first)
     return _join(mean_a, mean_b, pair, both + both * both / total, share, weight)
 
 
@@ -409,29 +273,33 @@ class SequentialIntersection(SmallestTrace):
         count = len(means)
         self._check_order(count)
         selected = np.ones((count, own.shape[-1]), dtype=np.bool_) if active is None else active
-        mean, fused = np.full(means.shape[1:], np.nan), np.full(own.shape[1:], np.nan)
+        xp, known = namespace(means, own), namespace(selected) is np
+        mean, fused = xp.full(means.shape[1:], np.nan), xp.full(own.shape[1:], np.nan)
         begun = np.zeros(selected.shape[-1], dtype=np.bool_)
         steps: list[_Step] = []
         for estimate in range(count) if self.order is None else self.order:
-            if not selected[estimate].any():
+            if known and not selected[estimate].any():
                 continue
             first, later = selected[estimate] & ~begun, selected[estimate] & begun
-            np.copyto(mean, means[estimate], where=first)
-            np.copyto(fused, own[estimate], where=first)
-            begun |= first
-            lanes = slice(None) if later.all() else np.flatnonzero(later)
+            mean = xp.where(first, means[estimate], mean)
+            fused = xp.where(first, own[estimate], fused)
+            begun = begun | first
+            lanes = slice(None) if known and later.all() else runs_of(xp.asarray(later))
             pair = None
-            if later.any():
+            if later.any() if known else steps:
                 pair = self.join(
-                    _lanes(mean, lanes),
-                    _lanes(fused, lanes),
-                    _lanes(means[estimate], lanes),
-                    _lanes(own[estimate], lanes),
-                    None if basis is None else _lanes(basis, lanes),
+                    at_runs(mean, lanes),
+                    at_runs(fused, lanes),
+                    at_runs(means[estimate], lanes),
+                    at_runs(own[estimate], lanes),
+                    None if basis is None else at_runs(basis, lanes),
                 )
-                mean[:, lanes], fused[..., lanes] = pair.mean, pair.covariance
+                mean, fused = (
+                    put_runs(mean, lanes, pair.mean),
+                    put_runs(fused, lanes, pair.covariance),
+                )
             steps.append(_Step(estimate, first, lanes, pair))
-        return Fused(mean, fused, lambda: _chained(steps, own.shape))
+        return Fused(mean, fused, lambda: _chained(steps, own.shape, xp))
 
     def _check_order(self, count: int | None = None) -> None:
         value = self.order
@@ -451,26 +319,21 @@ class _Step(NamedTuple):
 
     estimate: int
     first: NDArray[np.bool_]
-    lanes: slice | NDArray[np.intp]
+    lanes: slice | NDArray[Any]
     pair: Fused | None
 
 
-def _chained(steps: list[_Step], shape: tuple[int, ...]) -> Array:
+def _chained(steps: list[_Step], shape: tuple[int, ...], xp: Any) -> Array:
     """Return the gains (l, n, n, N) of all steps, each step's share times all later gains."""
-    gains = np.zeros(shape)
-    joined: list[int] = []
+    gains: dict[int, Array] = {}
     for estimate, first, lanes, pair in steps:
-        gains[estimate] = linalg.identity(shape[1]) * first
+        own = linalg.identity(shape[1]) * first
         if pair is not None:
             stored, taken = pair.gains
-            for earlier in joined:
-                gain = gains[earlier]
-                gain[..., lanes] = linalg.matmul(stored, _lanes(gain, lanes))
-            gains[estimate][..., lanes] = taken
-        joined.append(estimate)
-    return gains
-
-
-def _lanes(array: Array, lanes: slice | NDArray[np.intp]) -> Array:
-    """Return these runs with a contiguous batch axis."""
-    return array if isinstance(lanes, slice) else array.take(lanes, axis=-1)
+            for earlier, gain in gains.items():
+                gains[earlier] = put_runs(gain, lanes, linalg.matmul(stored, at_runs(gain, lanes)))
+            own = put_runs(own, lanes, taken)
+        gains[estimate] = own
+    nothing = np.zeros(shape[1:])
+    every = [gains.get(estimate, nothing) for estimate in range(shape[0])]
+    return xp.stack(every)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.namespace import namespace
+from fusion_gym.namespace import in_runs, namespace
 
 Active = NDArray[np.bool_] | None  # (l, N), the active estimates; all by default
 
@@ -86,12 +86,11 @@ class FusionRule(ABC):
             (n, n, N) without a delivery, and (l, n, n, N), entry i after node i's delivery only.
         """
         nowhere = np.zeros(silent.shape[:2] + silent.shape[-1:])
-        single = np.empty(silent.shape)
+        xp, single = namespace(silent, delivered), []
         for node in range(len(silent)):
-            covariances = silent.copy()
-            covariances[node] = delivered[node]
-            single[node] = self.fuse(nowhere, covariances, basis=basis).covariance
-        return self.fuse(nowhere, silent, basis=basis).covariance, single
+            parts = silent[:node], delivered[node : node + 1], silent[node + 1 :]
+            single.append(self.fuse(nowhere, xp.concatenate(parts), basis=basis).covariance)
+        return self.fuse(nowhere, silent, basis=basis).covariance, xp.stack(single)
 
 
 @dataclass(frozen=True)
@@ -111,14 +110,15 @@ class SmallestTrace(FusionRule):
             return basis
         plain = linalg.identity(len(self.state_weights)) if basis is None else basis
         weighted = np.sqrt(self.state_weights)[:, None, None] * plain
-        return np.broadcast_to(weighted, covariance.shape[-3:])
+        return namespace(weighted).broadcast_to(weighted, covariance.shape[-3:])
 
 
 def own_covariances(covariance: Array) -> Array:
     """Return the estimates' own covariances (l, n, n, N), also from the joint covariance."""
     if covariance.ndim == 4:
         return covariance
-    return linalg.symmetrise(np.stack([covariance[i, i] for i in range(len(covariance))]))
+    own = [covariance[i, i] for i in range(len(covariance))]
+    return linalg.symmetrise(namespace(covariance).stack(own))
 
 
 @dataclass(frozen=True)
@@ -199,29 +199,24 @@ class MatrixWeightedFusion(FusionRule):
 
     def weights(self, joint: Array) -> Array:
         """Return the weights A (l, n, n, N) for a joint covariance (l, l, n, n, N)."""
-        count, n, runs = len(joint), joint.shape[2], joint.shape[-1]
-        weights = np.zeros((count, n, n, runs))
-        for state in range(n):
-            weights[0, state, state] = 1.0
+        xp, count, n, runs = namespace(joint), len(joint), joint.shape[2], joint.shape[-1]
         if count == 1:
-            return weights
+            return np.broadcast_to(linalg.identity(n), joint.shape[1:])
         toward = joint[1:, 0] - joint[0, 0]  # Cov(D_i, x_1)
         spread = joint[1:, 1:] - joint[0, 1:] - toward[:, None]
         own = linalg.diagonal(own_covariances(joint))
         ridge = _RIDGE * (own[0] + own[1:])
-        ridge[ridge < np.finfo(np.float64).tiny] = 1.0  # where all variances are zero
+        # It is 1 where all variances are zero.
+        ridge = xp.where(ridge < np.finfo(np.float64).tiny, 1.0, ridge)
         size = (count - 1) * n
         spread = spread.swapaxes(1, 2).reshape(size, size, runs)
         ridge, toward = ridge.reshape(size, runs), toward.reshape(size, n, runs)
         solved = linalg.solve(linalg.add_diagonal(spread, ridge), toward)
-        (lanes,) = np.nonzero(np.isnan(solved).any((0, 1)))  # rounding made it indefinite
-        if lanes.size:
-            definite = linalg.gram(linalg.root(spread[..., lanes]))
-            definite = linalg.add_diagonal(definite, ridge[:, lanes])
-            solved[..., lanes] = linalg.solve(definite, toward[..., lanes])
-        weights[1:] = -linalg.transpose(solved.reshape(count - 1, n, n, runs))
-        weights[0] -= linalg.total(weights[1:], 0)
-        return weights
+        rounded = xp.isnan(solved)  # rounding made the matrix indefinite
+        (solved,) = in_runs(rounded, _solve_definite, (spread, ridge, toward), (solved,))
+        others = -linalg.transpose(solved.reshape(count - 1, n, n, runs))
+        first = linalg.identity(n) - linalg.total(others, 0)
+        return xp.concatenate((first[None], others))
 
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
@@ -255,3 +250,8 @@ class MatrixWeightedFusion(FusionRule):
                 for node, gain in zip(nodes, part.gains, strict=True):
                     gains[node][..., lanes] = gain
         return Fused(mean, fused, lambda: gains)
+
+
+def _solve_definite(spread: Array, ridge: Array, toward: Array) -> tuple[Array]:
+    definite = linalg.add_diagonal(linalg.gram(linalg.root(spread)), ridge)
+    return (linalg.solve(definite, toward),)

@@ -13,18 +13,15 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.intersection import (
-    REGULAR,
-    SequentialIntersection,
-    best_of_pair,
-    information_fusion,
-    orthonormalise,
-)
+from fusion_gym.fusion.diagonal import REGULAR, orthonormalise
+from fusion_gym.fusion.intersection import SequentialIntersection, best_of_pair, information_fusion
 from fusion_gym.fusion.rules import Active, Fused, SmallestTrace, own_covariances
+from fusion_gym.namespace import at_runs, in_runs, namespace, put_runs, repeat, runs_of, update_at
 
 _GAP = 1e-6  # relative optimality gap at which the search ends
 _STEPS = 100  # largest number of steps; most runs need 4, ill-conditioned ones about 30
 _NOTHING = 1e-22  # share of a state's least variance below which a direction counts as known
+_ALL = slice(None)
 _RIDGE = 1e-10  # keeps the curvature invertible where estimates are alike
 
 
@@ -62,24 +59,22 @@ class CovarianceIntersection(SmallestTrace):
         basis = self.metric(own, basis)
         if active is None:
             return covariance_intersection_many(means, own, basis=basis)
-        first = active.argmax(0)
-        mean = np.take_along_axis(means, first[None, None], 0)[0]
-        fused = np.take_along_axis(own, first[None, None, None], 0)[0]
-        weights = (np.arange(len(means))[:, None] == first) * 1.0
-        lanes = np.flatnonzero(active.sum(0) != 1)
-        metric = None if basis is None else _at(basis, lanes)
+        xp, first = namespace(means, own), active.argmax(0)
+        mean = xp.take_along_axis(means, first[None, None], 0)[0]
+        fused = xp.take_along_axis(own, first[None, None, None], 0)[0]
+        single = (np.arange(len(means))[:, None] == first) * 1.0
+        lanes = runs_of(xp.asarray(active.sum(0) != 1))
+        metric = None if basis is None else at_runs(basis, lanes)
         part = covariance_intersection_many(
-            _at(means, lanes), _at(own, lanes), _at(active, lanes), metric
+            at_runs(means, lanes), at_runs(own, lanes), at_runs(active, lanes), metric
         )
-        mean[:, lanes], fused[..., lanes] = part.mean, part.covariance
-        weights[:, lanes] = part.weights
 
         def gains() -> Array:
-            every: Array = weights[:, None, None] * linalg.identity(len(mean))
-            every[..., lanes] = part.gains
-            return every
+            every = single[:, None, None] * linalg.identity(len(mean))
+            return put_runs(every, lanes, part.gains)
 
-        return Fused(mean, fused, gains, weights)
+        mean, fused = put_runs(mean, lanes, part.mean), put_runs(fused, lanes, part.covariance)
+        return Fused(mean, fused, gains, put_runs(single.copy(), lanes, part.weights))
 
 
 @np.errstate(all="ignore")
@@ -113,47 +108,31 @@ def covariance_intersection_many(
     Source: the optimum is an A-optimal design, and the gap is J. Kiefer's, "General equivalence
     theory for optimum designs", Annals of Statistics 2, 1974.
     """
-    selected = np.ones(means.shape[::2], dtype=np.bool_) if active is None else active
-    means, covariances = np.ascontiguousarray(means), np.ascontiguousarray(covariances)
+    xp = namespace(means, covariances)
+    selected = xp.ones(means.shape[::2], dtype=np.bool_) if active is None else active
+    if xp is np:
+        means, covariances = np.ascontiguousarray(means), np.ascontiguousarray(covariances)
     information = _informations(covariances, selected)
-    metric = np.zeros_like(covariances[0])
+    metric = xp.zeros_like(covariances[0])
     metric += linalg.identity(len(metric)) if basis is None else basis
     weights, fused, open_lanes = _best_single(covariances, information, metric, selected)
-    singular = selected.any(0) & (~is_regular(covariances, information) & selected).any(0)
+    singular: Any = (~is_regular(covariances, information) & selected).any(0)
     open_lanes &= ~singular
     pairs = open_lanes & (selected.sum(0) == 2)
-    lanes = np.flatnonzero(pairs)
-    if lanes.size:
-        weights[:, lanes], fused[..., lanes] = best_of_pair(
-            _at(covariances, lanes), _at(selected, lanes), _at(metric, lanes)
-        )
-    lanes = np.flatnonzero(open_lanes & ~pairs)
-    if lanes.size:
-        taking_part = _at(selected, lanes)
-        start = taking_part / np.abs(_at(linalg.trace(covariances), lanes))
-        np.copyto(start, 0.0, where=~taking_part)
-        start /= linalg.total(start, 0)
-        weights[:, lanes], fused[..., lanes] = _search(
-            _at(information, lanes), _at(metric, lanes), start
-        )
-    vector = np.zeros_like(means[0])
+    pair = covariances, selected, metric
+    if active is not None or len(means) == 2:
+        weights, fused = in_runs(pairs[None], best_of_pair, pair, (weights, fused))
+    several = covariances, information, selected, metric
+    weights, fused = in_runs((open_lanes & ~pairs)[None], _best_of_all, several, (weights, fused))
+    vector = xp.zeros_like(means[0])
     for weight, item, mean, takes_part in zip(weights, information, means, selected, strict=True):
-        vector += weight * linalg.matvec(item, np.where(takes_part, mean, 0.0))
-    joined = linalg.matvec(fused, vector)
-    lanes = np.flatnonzero(singular)
-    if lanes.size:
-        own, taking_part = _at(covariances, lanes), _at(selected, lanes)
-        part, weights[:, lanes], fused[..., lanes] = _constrained(
-            own, taking_part, _at(metric, lanes)
-        )
-        known = np.where(taking_part[:, None], _at(means, lanes), 0.0)
-        joined[:, lanes] = linalg.total(linalg.matvec(part, known), 0)
+        vector += weight * linalg.matvec(item, xp.where(takes_part, mean, 0.0))
+    known = linalg.matvec(fused, vector), weights, fused, xp.zeros(covariances.shape)
+    joined, weights, fused, part = in_runs(singular[None], _constrained, (means, *pair), known)
 
     def gains() -> Array:
         every = linalg.matmul(fused, weights[:, None, None] * information)
-        if lanes.size:
-            every[..., lanes] = part
-        return every
+        return xp.where(singular, part, every)
 
     return Fused(joined, fused, gains, weights)
 
@@ -161,58 +140,64 @@ def covariance_intersection_many(
 def is_regular(covariance: Array, information: Array) -> NDArray[np.bool_]:
     """Return whether an inverse (..., n, n, N) is accurate to some 12 digits, (..., N)."""
     inflation = linalg.diagonal(covariance) * linalg.diagonal(information)
-    return np.asarray((REGULAR * inflation < 1.0).all(-2))
+    return namespace(inflation).all(REGULAR * inflation < 1.0, -2)
+
+
+def _best_of_all(
+    covariances: Array, information: Array, selected: NDArray[np.bool_], basis: Array
+) -> tuple[Array, Array]:
+    """Return weights (l, N) and covariance (n, n, N) of the smallest trace."""
+    xp = namespace(covariances)
+    start = xp.where(selected, 1.0 / xp.abs(linalg.trace(covariances)), 0.0)
+    return _search(information, basis, start / linalg.total(start, 0))
 
 
 def _constrained(
-    covariances: Array, selected: NDArray[np.bool_], basis: Array
-) -> tuple[Array, Array, Array]:
-    """Return gains (l, n, n, N), weights (l, N) and covariance for nearly singular covariances.
+    means: Array, covariances: Array, selected: NDArray[np.bool_], basis: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return mean, weights (l, N), covariance and gains for nearly singular covariances.
 
     The result is x = x_0 + R u: x_0 joins the estimates as if they were independent, with the
     covariance R Rᵀ, so that all Rᵀ P_i⁻ R are at most the identity.
 
     Args:
+        means: x_i (l, n, N).
         covariances: P_i (l, n, n, N).
         selected: (l, N).
         basis: (n, n, N).
     """
-    size = len(basis)
-    own = np.where(selected[:, None, None], covariances, linalg.identity(size))
+    size, xp = len(basis), namespace(covariances)
+    own = xp.where(selected[:, None, None], covariances, linalg.identity(size))
     first = SequentialIntersection(information_fusion).fuse(own[:, 0], own, selected)
-    least = np.where(selected[:, None], linalg.diagonal(own), np.inf).min(0)[:, None]
+    least = xp.where(selected[:, None], linalg.diagonal(own), np.inf).min(0)[:, None]
     root = linalg.root(first.covariance)
     root *= (root * root > _NOTHING * least).any(0) & (least > 0.0)
-    half = np.stack([orthonormalise(linalg.root(item)[None])[:, size : 2 * size] for item in own])
+    half = xp.stack([orthonormalise(linalg.root(item)[None])[:, size : 2 * size] for item in own])
     legs = linalg.matmul(half, root)
     information = linalg.matmul(linalg.transpose(legs), legs)
     information = linalg.add_diagonal(
-        information, np.where(root.any(0), 0.0, 1.0)
+        information, xp.where(root.any(0), 0.0, 1.0)
     )  # for unused directions
-    information *= selected[:, None, None]
+    information = information * selected[:, None, None]
     start = selected / selected.sum(0)
     weights, inside = _search(information, linalg.matmul(basis, root), start)
     part = linalg.matmul(linalg.matmul(root, inside), linalg.transpose(legs))
     part = linalg.matmul(weights[:, None, None] * part, half)
     rest = linalg.identity(size) - linalg.total(part, 0)
     gains = part + linalg.matmul(rest, first.gains)
-    return gains, weights, linalg.congruence(root, inside)
+    mean = linalg.total(linalg.matvec(gains, xp.where(selected[:, None], means, 0.0)), 0)
+    return mean, weights, linalg.congruence(root, inside), gains
 
 
 def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
     """Return the inverses (l, n, n, N) of the selected covariances, zero elsewhere."""
-    if selected.all():
-        return linalg.inverse(covariances)
-    information = np.zeros_like(covariances)
-    for estimate, takes_part in enumerate(selected):
-        lanes = np.flatnonzero(takes_part)
-        information[estimate][..., lanes] = linalg.inverse(_at(covariances[estimate], lanes))
-    return information
-
-
-def _at(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
-    """Return the given runs with a contiguous batch axis."""
-    return array.take(lanes, axis=-1)
+    xp = namespace(covariances)
+    if xp is not np or selected.all():
+        return xp.where(selected[:, None, None], linalg.inverse(covariances), 0.0)
+    result = np.zeros_like(covariances)
+    for own, covariance, takes_part in zip(result, covariances, selected, strict=True):
+        in_runs(takes_part[None], lambda part: (linalg.inverse(part),), (covariance,), (own,))
+    return result
 
 
 def _best_single(
@@ -232,14 +217,15 @@ def _best_single(
         search.
     """
     spread = linalg.matmul(covariances, linalg.transpose(basis))
-    traces = np.where(selected, linalg.trace(linalg.matmul(basis, spread)), np.inf)
+    xp = namespace(spread)
+    traces = xp.where(selected, linalg.trace(linalg.matmul(basis, spread)), np.inf)
     first = traces.argmin(0)
     weights = ((np.arange(len(traces))[:, None] == first) & selected) * 1.0
-    fused = np.take_along_axis(covariances, first[None, None, None], 0)[0]
     empty = ~selected.any(0)
-    fused[..., empty] = np.nan
+    fused = xp.take_along_axis(covariances, first[None, None, None], 0)[0]
+    fused = xp.where(empty, np.nan, fused)
     gain = _gain(information, linalg.matmul(fused, linalg.transpose(basis)))
-    total = np.where(empty, np.nan, traces.min(0))
+    total = xp.where(empty, np.nan, traces.min(0))
     closed = gain.max(0) - total <= _GAP * total
     return weights, fused, ~(closed | empty)
 
@@ -253,10 +239,10 @@ def _gain(information: Array, spread: Array) -> Array:
 
 def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Array]:
     """Return weights (l, N) and covariance (n, n, N) of the smallest trace, from ``start``."""
-    weights, fused = start.copy(), np.empty_like(information[0])
-    lanes = np.arange(start.shape[-1])
-    old, new, lowest = start, start, np.full(lanes.size, np.inf)
-    for _ in range(_STEPS):
+    xp, runs = namespace(information), start.shape[-1]
+
+    def step(state: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
+        lanes, weights, fused, information, basis, old, new, lowest = state
         root = _inverse_root(_weighted(new, information))
         covariance = linalg.matmul(root, linalg.transpose(root))
         spread = linalg.matmul(covariance, linalg.transpose(basis))
@@ -264,24 +250,31 @@ def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Arra
         gain = _gain(information, spread)
         worse = ~(total <= lowest) & (lowest < np.inf)
         open_lanes = worse | (gain.max(0) - total > _GAP * total)
-        if not open_lanes.all():
-            closed, still = np.flatnonzero(~open_lanes), np.flatnonzero(open_lanes)
-            weights[:, lanes[closed]] = _at(new, closed)
-            fused[..., lanes[closed]] = _at(covariance, closed)
-            if not still.size:
-                return weights, fused
-            lanes, information, worse = (lanes[still], _at(information, still), worse[still])
-            root, spread, gain = (_at(root, still), _at(spread, still), _at(gain, still))
-            basis = _at(basis, still)
-            old, new = _at(old, still), _at(new, still)
-            total, lowest = total[still], lowest[still]
-        target = _newton(information, new, root, spread, gain, total)
-        target = np.where(worse, 0.5 * (old + new), target)
-        old, lowest = np.where(worse, old, new), np.where(worse, lowest, total)
-        new = target
-    weights[:, lanes] = old
-    fused[..., lanes] = linalg.inverse(_weighted(old, information))
-    return weights, fused
+        if xp is not np or not open_lanes.all():
+            closed, still = runs_of(~open_lanes), runs_of(open_lanes)
+            ended = lanes[closed] if xp is np else lanes & closed
+            weights = put_runs(weights, ended, at_runs(new, closed))
+            fused = put_runs(fused, ended, at_runs(covariance, closed))
+            lanes = lanes[still] if xp is np else lanes & still
+            parts = information, basis, old, new, lowest, worse, root, spread, gain, total
+            parts = tuple(at_runs(part, still) for part in parts)
+            information, basis, old, new, lowest, worse, root, spread, gain, total = parts
+        goes_on = lanes.any() if xp is not np else lanes.size > 0
+        if goes_on is not False:
+            target = _newton(information, new, root, spread, gain, total)
+            target = xp.where(worse, 0.5 * (old + new), target)
+            old, lowest = xp.where(worse, old, new), xp.where(worse, lowest, total)
+            new = target
+        return goes_on, (lanes, weights, fused, information, basis, old, new, lowest)
+
+    lanes = np.arange(runs) if xp is np else xp.full(runs, True)
+    lowest, fused = xp.full(runs, np.inf), xp.empty_like(information[0])
+    state = lanes, start.copy(), fused, information, basis, start, start, lowest
+    lanes, weights, fused, information, _, old, *_ = repeat(step, state, _STEPS)
+    if xp is np and not lanes.size:
+        return weights, fused
+    fused = put_runs(fused, lanes, linalg.inverse(_weighted(old, information)))
+    return put_runs(weights, lanes, old), fused
 
 
 def _weighted(weights: Array, information: Array) -> Array:
@@ -294,17 +287,18 @@ def _weighted(weights: Array, information: Array) -> Array:
 
 def _inverse_root(matrix: Array) -> Array:
     """Return the upper triangular U (n, n, N) with U Uᵀ the inverse, NaN if not definite."""
-    size = len(matrix)
-    stack = np.zeros((2 * size, size, matrix.shape[-1]))  # rows from n on become U
-    stack[:size] = matrix
+    xp, size = namespace(matrix), len(matrix)
+    unit = xp.zeros_like(matrix) + linalg.identity(size)
+    stack = xp.concatenate((matrix, unit))  # rows from n on become U
     for k in range(size):
-        stack[size + k, k] = 1.0
-        pivot = np.sqrt(stack[k, k])
+        rows, later = slice(k + 1, size + k + 1), slice(k + 1, None)
+        pivot = xp.sqrt(stack[k, k])
         pivot /= stack[k, k]  # NaN where it is not positive
-        column = stack[k + 1 : size + k + 1, k]
-        column *= pivot
+        stack = update_at(np.multiply, stack, (..., rows, k, _ALL), pivot)
+        column = stack[rows, k]
         if k + 1 < size:
-            stack[k + 1 : size + k + 1, k + 1 :] -= column[:, None] * column[: size - k - 1]
+            product = column[:, None] * column[: size - k - 1]
+            stack = update_at(np.subtract, stack, (..., rows, later, _ALL), product)
     return stack[size:]
 
 
@@ -328,96 +322,92 @@ def _newton(
         gain: (l, N).
         total: Trace (N,).
     """
-    free = (weights > 0.0) | (gain > total)
-    somewhere = free.any(1)
-    if not somewhere.all():  # skip estimates that are inactive in every run
-        target = np.zeros_like(weights)
-        target[somewhere] = _newton(
+    free: Any = (weights > 0.0) | (gain > total)
+    xp, somewhere = namespace(weights), free.any(1)
+    if xp is np and not somewhere.all():  # skip estimates that are inactive in every run
+        place = np.cumsum(somewhere) - 1
+        part = _newton(
             information[somewhere], weights[somewhere], root, spread, gain[somewhere], total
         )
-        return target
+        return np.where(somewhere[:, None], part[place], 0.0)
     curvature = _curvature(information, root, spread)
-    target = _model_minimum(curvature, gain, free)
-    reached = weights.copy()
-    lanes = np.flatnonzero((target < 0.0).any(0))
-    for _ in range(len(weights) - 1):
-        if not lanes.size:
-            break
-        reached[:, lanes], blocking = _as_far(_at(reached, lanes), _at(target, lanes))
-        mask = _at(free, lanes) & ~blocking
-        trial = _model_minimum(_at(curvature, lanes), _at(gain, lanes), mask)
-        free[:, lanes], target[:, lanes] = mask, trial
-        lanes = lanes[(trial < 0.0).any(0)]
-    target /= linalg.total(target, 0)
-    sound = (linalg.dot(target - weights, gain) > 0.0) & (target >= 0.0).all(0)
-    unsound = np.flatnonzero(~sound)
-    if unsound.size:
-        target[:, unsound] = _exchange(
-            _at(weights, unsound), _at(gain, unsound), _at(curvature, unsound)
-        )
+
+    def step(state: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
+        reached, free, target = state
+        negative = (target < 0.0).any(0)
+        goes_on = negative.any()
+        if xp is not np or goes_on:
+            lanes = runs_of(negative)
+            further, blocking = _as_far(at_runs(reached, lanes), at_runs(target, lanes))
+            mask = at_runs(free, lanes) & ~blocking
+            trial = _model_minimum(at_runs(curvature, lanes), at_runs(gain, lanes), mask)
+            parts = zip(state, (further, mask, trial), strict=True)
+            reached, free, target = (put_runs(old, lanes, part) for old, part in parts)
+        return goes_on, (reached, free, target)
+
+    start = weights.copy(), free, _model_minimum(curvature, gain, free)
+    target = repeat(step, start, len(weights) - 1)[2]
+    target = target / linalg.total(target, 0)
+    sound: Any = (linalg.dot(target - weights, gain) > 0.0) & (target >= 0.0).all(0)
+    (target,) = in_runs(~sound[None], _exchange, (weights, gain, curvature), (target,))
     return target
 
 
 def _as_far(weights: Array, target: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the last non-negative weights (l, N) towards the target, and the blocking ones."""
-    reach = np.full_like(weights, np.inf)
-    np.divide(weights, weights - target, out=reach, where=target < 0.0)
+    xp = namespace(weights)
+    reach = xp.where(target < 0.0, weights / (weights - target), np.inf)
     length = reach.min(0)
     blocking = reach == length
-    reached = np.where(blocking, 0.0, weights + length * (target - weights))
-    return np.maximum(reached, 0.0), blocking
+    reached = xp.where(blocking, 0.0, weights + length * (target - weights))
+    return xp.maximum(reached, 0.0), blocking
 
 
 def _curvature(information: Array, root: Array, spread: Array) -> Array:
     """Return 2 tr(Sᵀ Y_i P Y_j S), (l, l, N), for i <= j, zero below."""
     count, size, _, runs = information.shape
     legs = linalg.matmul(information, spread)
-    for row in range(size - 1, -1, -1):
-        legs[:, row] *= root[row, row]
+    xp, rows = namespace(legs), []
+    for row in range(size):
+        moved = legs[:, row] * root[row, row]
         for other in range(row):
-            legs[:, row] += root[other, row] * legs[:, other]
-    legs = legs.reshape(count, -1, runs)
+            moved += root[other, row] * legs[:, other]
+        rows.append(moved)
+    legs = xp.stack(rows, axis=1).reshape(count, -1, runs)
     scaled = legs + legs
-    result = np.zeros((count, count, runs))
-    for i in range(count):
-        result[i, i:] = linalg.total(scaled[i] * legs[i:])
-    return result
+    upper = [linalg.total(scaled[i] * legs[i:]) for i in range(count)]
+    return xp.stack([xp.concatenate((xp.zeros((i, runs)), row)) for i, row in enumerate(upper)])
 
 
 def _model_minimum(curvature: Array, gain: Array, free: NDArray[np.bool_]) -> Array:
     """Return t (l, N), Σ t = 1, zero outside ``free``, that minimises tᵀ H t / 2 - 3 gainᵀ t."""
-    count, mask = len(gain), free * 1.0
-    work = np.zeros((count, count + 2, gain.shape[-1]))
-    for i in range(count):
-        np.multiply(curvature[i, i:], mask[i] * mask[i:], out=work[i, i:count])
-        work[i, i] *= 1.0 + _RIDGE
-        work[i, i] += 1.0 - mask[i]
-        np.multiply(gain[i], 3.0 * mask[i], out=work[i, count])
-        work[i, count + 1] = mask[i]
+    xp, count, mask = namespace(gain), len(gain), free * 1.0
+    unit, right = linalg.identity(count), slice(count, None)
+    work = curvature * (mask[:, None] * mask) * (1.0 + _RIDGE * unit) + unit * (1.0 - mask)
+    work = xp.concatenate((work, (3.0 * mask * gain)[:, None], mask[:, None]), axis=1)
     for k in range(count - 1):
-        factor = work[k, k + 1 : count] / work[k, k]
-        work[k + 1 :, k + 1 :] -= factor[:, None] * work[k, k + 1 :]
+        factor, later = work[k, k + 1 : count] / work[k, k], slice(k + 1, None)
+        product = factor[:, None] * work[k, later]
+        work = update_at(np.subtract, work, (..., later, later, _ALL), product)
     for k in range(count - 1, -1, -1):
-        work[k, count:] /= work[k, k]
-        if k:
-            work[:k, count:] -= work[:k, k, None] * work[k, count:]
+        work = update_at(np.divide, work, (..., k, right, _ALL), work[k, k])
+        product = work[:k, k, None] * work[k, right]
+        work = update_at(np.subtract, work, (..., slice(k), right, _ALL), product)
     pull, level = work[:, count], work[:, count + 1]
     excess = (linalg.total(pull, 0) - 1.0) / linalg.total(level, 0)
     minimum: Array = pull - excess * level
     return minimum
 
 
-def _exchange(weights: Array, gain: Array, curvature: Array) -> Array:
+def _exchange(weights: Array, gain: Array, curvature: Array) -> tuple[Array]:
     """Return weights (l, N) after a move from the estimate of the smallest gain to the largest."""
-    lanes = np.arange(weights.shape[-1])
+    xp, lanes, place = namespace(weights), np.arange(weights.shape[-1]), np.arange(len(gain))
     most = gain.argmax(0)
-    least = np.where(weights > 0.0, gain, np.inf).argmin(0)
+    least = xp.where(weights > 0.0, gain, np.inf).argmin(0)
     bend = curvature[most, most, lanes] + curvature[least, least, lanes]
-    bend -= 2.0 * curvature[np.minimum(most, least), np.maximum(most, least), lanes]
+    bend -= 2.0 * curvature[xp.minimum(most, least), xp.maximum(most, least), lanes]
     reach = weights[least, lanes]
     length = (gain[most, lanes] - gain[least, lanes]) / bend
-    length = np.where((length > 0.0) & (length < reach), length, reach)
-    moved = weights.copy()
-    moved[most, lanes] += length
-    moved[least, lanes] -= length
-    return moved
+    length = xp.where((length > 0.0) & (length < reach), length, reach)
+    moved = weights + xp.where(place[:, None] == most, length, 0.0)
+    return (moved - xp.where(place[:, None] == least, length, 0.0),)

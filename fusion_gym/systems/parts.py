@@ -63,6 +63,7 @@ class SensorPlant(Plant[StateT]):
 
     dynamics: Any
     sensors: Any
+    numpy_only = None
 
     @property
     def sensor_count(self) -> int:
@@ -103,6 +104,7 @@ class ScaledEstimator(Estimator[StateT]):
     state_weights: Array
     magnitude: Array
     reference: Array
+    numpy_only = None
 
     def trace(self, covariance: Array) -> Array:
         """Return the weighted trace (N,) of a covariance (n, n, N)."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.linear_plant import LinearPlant
 
@@ -147,8 +148,8 @@ class JointErrorCovariance:
 
     def update(self, joint: Array, gain: Array, granted: NDArray[np.bool_]) -> Array:
         """Return the joint covariance after granted (l, N) nodes update with gains (l, n, m, N)."""
-        used = np.zeros((len(joint), *gain.shape[1:]))
-        used[1:] = np.where(granted[:, None, None], gain, 0.0)
+        xp, nothing = namespace(gain), np.zeros((1, *gain.shape[1:]))
+        used = xp.concatenate((nothing, xp.where(granted[:, None, None], gain, 0.0)))
         retention = linalg.identity(joint.shape[-2]) - linalg.matmul(used, self.measurement_matrix)
         result = linalg.matmul(retention[:, None], joint)
         result = linalg.matmul(result, linalg.transpose(retention)[None])
@@ -162,11 +163,10 @@ class JointErrorCovariance:
         """Return the joint covariance after estimate 0 becomes Σ_j weights_j · estimate j."""
         row = linalg.total(linalg.matmul(weights[:, None], joint), 0)
         fused = linalg.total(linalg.matmul(row, linalg.transpose(weights)), 0)
-        result = joint.copy()
-        result[0] = row
-        result[:, 0] = linalg.transpose(row)
-        result[0, 0] = linalg.symmetrise(fused)
-        return result
+        xp, column = namespace(joint), linalg.transpose(row)[1:, None]
+        first = xp.concatenate((linalg.symmetrise(fused)[None], row[1:]))
+        others = xp.concatenate((column, joint[1:, 1:]), axis=1)
+        return xp.concatenate((first[None], others))
 
 
 def _transposed(joint: Array) -> Array:

@@ -11,7 +11,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
@@ -27,6 +26,7 @@ from fusion_gym.core.knowledge import (
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
+from fusion_gym.namespace import namespace, ndtr, set_at, update_at
 from fusion_gym.systems.correlated.filters import (
     JointErrorCovariance,
     RobustKalmanFilter,
@@ -37,6 +37,7 @@ from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.validation import refusal
 
+_ALL = slice(None)
 RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
 
 
@@ -71,7 +72,7 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
         """Draw the initial state; nothing has been measured."""
         noise, departure = self.nature.begin(noise)
         scale = self._scale(noise[-1])
-        truth = self.dynamics.start(self.dynamics.initial_mean, np.sqrt(scale) * noise[:-1])
+        truth = self.dynamics.start(self.dynamics.initial_mean, scale**0.5 * noise[:-1])
         nothing = np.full((self.sensors.count, self.sensors.size, noise.shape[-1]), np.nan)
         return CorrelatedTrackingTruth(truth, nothing, departure, scale), None
 
@@ -80,7 +81,7 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
 
         Source: adaptive_innovation, equations (1)-(3).
         """
-        actual, r = np.sqrt(state.scale) * noise, self.dynamics.noise_channels
+        actual, r = state.scale**0.5 * noise, self.dynamics.noise_channels
         process, own = true_noise(state.departure, actual[:r], actual[r:])
         truth = self.dynamics.advance(state.truth, process, state.departure)
         return replace(state, truth=truth, measurement=self.sensors.measure(truth, process, own))
@@ -234,21 +235,24 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         Source: adaptive_innovation, equations (12), (37)-(41) or (47)-(53).
         """
         outcomes, arrived = sensed(state.outcomes), reception.arrived
-        grant = arrived[:, None]
-        mean, covariance = state.prior_mean.copy(), state.prior_covariance.copy()
+        grant, xp, nodes = arrived[:, None], namespace(arrived), slice(1, None)
         correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
-        mean[1:] += np.where(grant, correction, 0.0)
-        np.copyto(covariance[1:], outcomes.delivered_covariance, where=grant[:, None])
+        correction = xp.where(grant, correction, 0.0)
+        mean = update_at(np.add, state.prior_mean.copy(), (..., nodes, _ALL, _ALL), correction)
+        prior = state.prior_covariance
+        own = xp.where(grant[:, None], outcomes.delivered_covariance, prior[1:])
+        covariance = xp.concatenate((prior[:1], own))
         fused = self.fusion.fuse(mean, covariance, _with_prediction(arrived))
-        mean[0], covariance[0] = fused.mean, fused.covariance
+        mean = set_at(mean, (..., 0, _ALL, _ALL), fused.mean)
+        covariance = set_at(covariance, (..., 0, _ALL, _ALL, _ALL), fused.covariance)
         joint = state.joint
         if self.joint is not None and joint is not None:
             joint = self.joint.update(joint, outcomes.gain, arrived)
             joint = self.joint.fuse(joint, fused.gains)
         return replace(
             state,
-            held=np.where(grant, state.measurement, state.held),
-            age=np.where(arrived, 0.0, state.age),
+            held=xp.where(grant, state.measurement, state.held),
+            age=xp.where(arrived, 0.0, state.age),
             means=mean,
             covariances=covariance,
             joint=joint,
@@ -274,13 +278,14 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
         means = state.prior_mean[1:] + correction, state.prior_mean[0]
         covariances = outcomes.delivered_covariance, state.prior_covariance[0]
+        xp = namespace(correction)
         pairs = (
-            np.stack((np.tile(prior, count), np.concatenate(posterior, axis=-1)))
+            xp.stack((xp.tile(prior, count), xp.concatenate([*posterior], axis=-1)))
             for posterior, prior in (means, covariances)
         )
         fused = self._pair.fuse(*pairs)
         mean, covariance = (
-            np.stack(np.split(values, count, axis=-1)) for values in (fused.mean, fused.covariance)
+            xp.stack(xp.split(values, count, axis=-1)) for values in (fused.mean, fused.covariance)
         )
         return mean, covariance
 
@@ -292,9 +297,11 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         runs: NDArray[np.bool_],
     ) -> CorrelatedTrackingEstimate:
         """Replace the fused estimate in ``runs`` (N,), not the nodes'."""
-        means, covariances = state.means.copy(), state.covariances.copy()
-        means[0] = np.where(runs, mean, means[0])
-        covariances[0] = np.where(runs, covariance, covariances[0])
+        xp, before = namespace(runs), (state.means, state.covariances)
+        parts = zip((mean, covariance), before, strict=True)
+        means, covariances = (
+            xp.concatenate((xp.where(runs, new, old[0])[None], old[1:])) for new, old in parts
+        )
         return replace(state, means=means, covariances=covariances)
 
     def mean(self, state: CorrelatedTrackingEstimate) -> Array:
@@ -348,7 +355,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
 
     def _variance_reduction(self, state: CorrelatedTrackingEstimate) -> Array:
         reduced = [self.trace(covariance) for covariance in self.single_deliveries(state)[1]]
-        return self.trace(state.prior_covariance[0]) - np.array(reduced)
+        return self.trace(state.prior_covariance[0]) - namespace(reduced[0]).stack(reduced)
 
     @property
     def _pair(self) -> FusionRule:
@@ -360,9 +367,10 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
 
 def _with_prediction(granted: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Who takes part in the fusion (l + 1, N): the centre's prediction always does."""
-    return np.concatenate((np.ones_like(granted[:1]), granted))
+    xp = namespace(granted)
+    return xp.concatenate((xp.ones_like(granted[:1]), granted))
 
 
 def _deviation(covariance: Array) -> Array:
     """Square roots of the diagonals: (..., m, m, N) to (..., m, N)."""
-    return np.sqrt(linalg.diagonal(covariance))
+    return linalg.diagonal(covariance) ** 0.5

@@ -24,6 +24,7 @@ from fusion_gym.core.knowledge import (
     numbered,
     sensed,
 )
+from fusion_gym.namespace import namespace
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
@@ -113,7 +114,9 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
             block(
                 "innovation_log_deviation",
                 "logarithm of the innovation's deviation over the measurement's root mean square",
-                lambda s: np.log(self._deviation(sensed(s.prediction)) / scale),
+                lambda s: namespace(s.belief.mean).log(
+                    self._deviation(sensed(s.prediction)) / scale
+                ),
                 (nodes,),
                 constants=measured,
             ),
@@ -155,7 +158,8 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
     ) -> MarkovJumpCentralEstimate:
         """Take the measurements of the sensors that sample."""
         sampled = self.model.sensors.sampled(state.time)[:, None]
-        return replace(state, measurement=np.where(sampled, measurement, state.held))
+        seen = namespace(sampled).where(sampled, measurement, state.held)
+        return replace(state, measurement=seen)
 
     def update(
         self, state: MarkovJumpCentralEstimate, reception: Reception
@@ -164,13 +168,14 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
         sensed(state.prediction)
         taken = reception.arrived & self.model.sensors.sampled(state.time)
         # What is not taken counts for nothing, and may be no number where it is not visible.
-        held = np.where(taken[:, None], state.measurement, state.held)
+        xp = namespace(taken)
+        held = xp.where(taken[:, None], state.measurement, state.held)
         belief = self.filter.update(state.belief, held[:, 0], taken, state.time)
         mean, covariance = self.filter.estimate(belief)
         return replace(
             state,
             held=held,
-            age=np.where(taken, 0.0, state.age),
+            age=xp.where(taken, 0.0, state.age),
             belief=belief,
             mean=mean,
             covariance=covariance,
@@ -202,10 +207,10 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
 
     def _innovation(self, state: MarkovJumpCentralEstimate, prediction: ModePrediction) -> Array:
         surprise = state.measurement[:, 0] - prediction.mean[self.model.plant.size :]
-        return np.where(self.model.sensors.sampled(state.time), surprise, 0.0)
+        return namespace(surprise).where(self.model.sensors.sampled(state.time), surprise, 0.0)
 
     def _deviation(self, prediction: ModePrediction) -> Array:
-        return np.sqrt(linalg.diagonal(prediction.covariance)[self.model.plant.size :])
+        return linalg.diagonal(prediction.covariance)[self.model.plant.size :] ** 0.5
 
     def _reduction(self, covariance: Array, weights: Array, useful: NDArray[np.bool_]) -> Array:
         """Return the reduction (l, N) of the weighted trace by each single measurement."""
@@ -213,24 +218,26 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
         cross = covariance[:n, n:]
         squares = linalg.total(weights[:, None, None] * cross * cross, 0)
         own = linalg.diagonal(covariance)[n:]
-        return np.where(useful, squares / np.where(useful, own, 1.0), 0.0)
+        xp = namespace(squares)
+        return xp.where(useful, squares / xp.where(useful, own, 1.0), 0.0)
 
     def _greedy_variance(
         self, state: MarkovJumpCentralEstimate, prediction: ModePrediction
     ) -> Array:
         """Return the trace as samples join in the order of the largest reduction."""
         n, covariance = self.model.plant.size, prediction.covariance
+        xp = namespace(covariance)
         left = self.model.sensors.sampled(state.time)
         sensors, result = np.arange(self.model.sensors.count)[:, None], np.zeros(left.shape)
         for _ in range(self.model.sensors.count):
-            gain = np.where(left, self._reduction(covariance, np.ones(n), left), -1.0)
+            gain = xp.where(left, self._reduction(covariance, np.ones(n), left), -1.0)
             best = gain.argmax(0)
             selected = (sensors == best) & left
             trace = linalg.trace(covariance[:n, :n])
-            result[selected] = np.broadcast_to(trace, left.shape)[selected]
-            column = np.take_along_axis(covariance, (n + best)[None, None], axis=1)[:, 0]
-            own = np.take_along_axis(column, (n + best)[None], axis=0)[0]
-            weight = np.where(selected.any(0), 1.0 / np.where(selected.any(0), own, 1.0), 0.0)
+            result = xp.where(selected, trace, result)
+            column = xp.take_along_axis(covariance, (n + best)[None, None], axis=1)[:, 0]
+            own = xp.take_along_axis(column, (n + best)[None], axis=0)[0]
+            weight = xp.where(selected.any(0), 1.0 / xp.where(selected.any(0), own, 1.0), 0.0)
             covariance = covariance - linalg.outer(column, column) * weight
             left = left & ~selected
         return result

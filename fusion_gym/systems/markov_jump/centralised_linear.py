@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace, set_at, take, update_at
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     LONGEST,
     ROUNDING,
@@ -24,6 +25,8 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     Times,
     settled,
 )
+
+_ALL = slice(None)
 
 
 class Belief(NamedTuple):
@@ -53,11 +56,12 @@ def with_noise(
     probability: Array, mean: Array, covariance: Array, noise_covariance: Array
 ) -> Belief:
     """Return a prediction from the state's moments (M, a, N), (M, a, a, N) and Q (r, r)."""
-    models, size, runs = mean.shape
-    whole = size + len(noise_covariance)
-    means, spread = np.zeros((models, whole, runs)), np.zeros((models, whole, whole, runs))
-    means[:, :size], spread[:, :size, :size] = mean, covariance
-    spread[:, size:, size:] = noise_covariance[..., None]
+    xp, (models, size, runs) = namespace(mean), mean.shape
+    whole, state, noise = size + len(noise_covariance), slice(size), slice(size, None)
+    means, spread = xp.zeros((models, whole, runs)), xp.zeros((models, whole, whole, runs))
+    means = set_at(means, (..., state, _ALL), mean)
+    spread = set_at(spread, (..., state, state, _ALL), covariance)
+    spread = set_at(spread, (..., noise, noise, _ALL), noise_covariance[..., None])
     return Belief(probability, means, spread)
 
 
@@ -76,18 +80,18 @@ def condition_on(
         measurement: (l, N).
         taken: (l, N).
     """
-    mean, covariance = belief.mean, belief.covariance
-    likelihood = np.zeros(belief.probability.shape)
+    mean, covariance, xp = belief.mean, belief.covariance, namespace(taken)
+    likelihood = xp.zeros(belief.probability.shape)
     for sensor in range(len(measurement)):
         row = rows[:, sensor]
         cross = linalg.matvec(covariance, row)
         spread = linalg.dot(row, cross) + variance[:, sensor]
         surprise = measurement[sensor] - linalg.dot(row, mean)
-        weight = np.where(taken[sensor], 1.0 / spread, 0.0)
+        weight = xp.where(taken[sensor], 1.0 / spread, 0.0)
         mean = mean + cross * (weight * surprise)[:, None]
         covariance = covariance - linalg.outer(cross, cross) * weight[:, None, None]
-        loss = surprise * surprise / spread + np.log(spread)
-        likelihood -= np.where(taken[sensor], 0.5 * loss, 0.0)
+        loss = surprise * surprise / spread + xp.log(spread)
+        likelihood -= xp.where(taken[sensor], 0.5 * loss, 0.0)
     return Belief(belief.probability, mean, covariance), likelihood
 
 
@@ -95,9 +99,10 @@ def mode_mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
     """Return mean (p, N) and covariance (p, p, N) of maps · z over all models."""
     means = linalg.matvec(maps, belief.mean)
     spreads = linalg.congruence(maps, belief.covariance)
-    deviation = np.sqrt(np.maximum(linalg.diagonal(belief.covariance), 0.0))
+    xp = namespace(means)
+    deviation = xp.sqrt(xp.maximum(linalg.diagonal(belief.covariance), 0.0))
     certain = linalg.diagonal(spreads) <= ROUNDING * linalg.matvec(np.abs(maps), deviation) ** 2
-    spreads[certain[:, :, None] | certain[:, None]] = 0.0
+    spreads = xp.where(certain[:, :, None] | certain[:, None], 0.0, spreads)
     if len(means) == 1:
         return means[0], spreads[0]
     mean = linalg.total(belief.probability[:, None] * means, 0)
@@ -112,7 +117,7 @@ def predict_jointly(belief: Belief, maps: Array, variance: Array) -> ModePredict
     own, sensors = linalg.total(belief.probability[:, None] * variance, 0), variance.shape[1]
     for sensor in range(sensors):
         place = len(mean) - sensors + sensor
-        covariance[place, place] += own[sensor]
+        covariance = update_at(np.add, covariance, (..., place, place, _ALL), own[sensor])
     return ModePrediction(mean, covariance)
 
 
@@ -209,9 +214,9 @@ class CentralisedLinearFilter:
     def predict(self, belief: Belief, time: Times) -> Belief:
         """Return the prediction for ``time`` + 1 from the belief after ``time`` (N,)."""
         place = self._at(time)
-        motion = self.motion.take(place, -1)
+        motion = take(self.motion, place)
         covariance = linalg.congruence(motion, belief.covariance[0])
-        covariance += self.additional.take(place, -1)
+        covariance += take(self.additional, place)
         mean = linalg.matvec(motion, belief.mean[0])
         noise = self.model.plant.noise_covariance
         return with_noise(belief.probability, mean[None], covariance[None], noise)
@@ -232,7 +237,7 @@ class CentralisedLinearFilter:
         return mode_mixture(belief, self.maps[:, : self.model.plant.size])
 
     def _variance(self, time: Times) -> Array:
-        return self.variance.take(self._at(time), -1)[None]
+        return take(self.variance, self._at(time))[None]
 
     def _at(self, time: Times) -> Times:
-        return np.minimum(time, self.variance.shape[-1] - 1)
+        return namespace(time).minimum(time, self.variance.shape[-1] - 1)

@@ -13,6 +13,7 @@ import numpy as np
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.namespace import namespace
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw_mode
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
@@ -72,12 +73,13 @@ class FadingPlant(SensorPlant[MarkovJumpTruth]):
         Source: markov_jump, equations (3), (4).
         """
         plant, sensors, moving = self.dynamics, self.sensors, self.dynamics.noise_channels
-        fading, own = np.split(noise[moving + 1 :], (sensors.count,))
+        xp = namespace(noise)
+        fading, own = xp.split(noise[moving + 1 :], (sensors.count,))
         process, own = true_noise(state.departure, noise[:moving], own)
         following = plant.advance(state.truth, state.mode, state.process_noise, state.departure)
         jumped = plant.jump(state.mode, noise[moving])
         drawn = plant.process_noise(process)
-        measurement = sensors.measure(following, jumped, drawn, np.concatenate((fading, own)))
+        measurement = sensors.measure(following, jumped, drawn, xp.concatenate((fading, own)))
         return MarkovJumpTruth(
             following, measurement[:, None], state.departure, state.time + 1, jumped, drawn
         )

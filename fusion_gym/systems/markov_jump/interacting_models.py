@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     ModePrediction,
@@ -103,22 +104,21 @@ class InteractingModels:
 
     def predict(self, belief: Belief, time: Times) -> Belief:
         """Return the prediction for ``time`` + 1 from the belief after ``time`` (N,)."""
-        modes, chain = range(self.plant.modes), self.plant.mode_transition
+        xp, chain = namespace(belief.mean), self.plant.mode_transition
         moved = linalg.matvec(self.motion, belief.mean)
         spread = linalg.congruence(self.motion, belief.covariance)
-        probability = np.empty_like(belief.probability)
-        mean, covariance = np.empty_like(moved), np.empty_like(spread)
-        for later in modes:
+        beliefs = []
+        for later in range(self.plant.modes):
             joint = chain[:, later, None] * belief.probability
-            probability[later] = linalg.total(joint)
-            possible = probability[later] > 0.0  # else any weights will do
-            weights = np.where(possible, joint, 1.0 / self.plant.modes)
-            weights /= np.where(possible, probability[later], 1.0)
-            mean[later] = linalg.total(weights[:, None] * moved, 0)
-            apart = moved - mean[later]
-            covariance[later] = linalg.total(
-                weights[:, None, None] * (spread + linalg.outer(apart, apart)), 0
-            )
+            own = linalg.total(joint)
+            possible = own > 0.0  # else any weights will do
+            weights = xp.where(possible, joint, 1.0 / self.plant.modes)
+            weights /= xp.where(possible, own, 1.0)
+            mixed = linalg.total(weights[:, None] * moved, 0)
+            apart = moved - mixed
+            second = weights[:, None, None] * (spread + linalg.outer(apart, apart))
+            beliefs.append((own, mixed, linalg.total(second, 0)))
+        probability, mean, covariance = map(xp.stack, zip(*beliefs, strict=True))
         probability /= linalg.total(probability)
         return with_noise(probability, mean, covariance, self.plant.noise_covariance)
 
@@ -133,8 +133,9 @@ class InteractingModels:
         rows, variance = self.maps[:, self.plant.size :], self._variance(belief)
         after, likelihood = condition_on(belief, rows, variance, measurement, taken)
         # The likeliest possible model has weight one, so that far tails do not make 0 / 0.
-        possible = np.where(belief.probability > 0.0, likelihood, -np.inf)
-        weights = belief.probability * np.exp(possible - possible.max(0))
+        xp = namespace(likelihood)
+        possible = xp.where(belief.probability > 0.0, likelihood, -np.inf)
+        weights = belief.probability * xp.exp(possible - possible.max(0))
         return after._replace(probability=weights / linalg.total(weights))
 
     def estimate(self, belief: Belief) -> tuple[Array, Array]:
@@ -147,4 +148,4 @@ class InteractingModels:
         mean, covariance = belief.mean[:, :n], belief.covariance[:, :n, :n]
         second = covariance + linalg.outer(mean, mean)
         observed = linalg.quadratic(self.unfaded, second[:, None])
-        return np.asarray(self.sensors.fading_variance[:, None] * observed + self.sensors.variance)
+        return self.sensors.fading_variance[:, None] * observed + self.sensors.variance

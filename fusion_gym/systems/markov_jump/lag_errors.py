@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace, take
 from fusion_gym.systems.markov_jump.linear_minimum_variance import ROUNDING, LocalFilters, Times
 
 
@@ -50,10 +51,11 @@ class JointPrediction(NamedTuple):
         result = crossed + crossed.swapaxes(0, 1).swapaxes(2, 3)
         result += self.local
         result += (behind[:, None] * behind[None])[:, :, None, None] * self.lag
-        certain = np.einsum("iissN->isN", result) <= self.floor
-        if certain.any():
-            result[certain[:, None, :, None] | certain[None, :, None]] = 0.0
-        return result
+        xp = namespace(result)
+        certain = xp.einsum("iissN->isN", result) <= self.floor
+        if xp is np and not certain.any():
+            return result
+        return xp.where(certain[:, None, :, None] | certain[None, :, None], 0.0, result)
 
 
 @dataclass(frozen=True)
@@ -118,40 +120,43 @@ class LagRecursion:
         """Return the covariances at k+1|k after ``sent`` (l, N), with the ``place`` (N,) of k."""
         filters, silent = self.filters, 1.0 - sent
         count, transition = len(silent), filters.transition
-        step = filters.step.take(place, -1)
-        innovation = filters.innovation_covariance.take(place, -1)
-        ahead = filters.predicted_cross.take(place, -1)
-        following = LagCovariances(np.empty_like(now.lag), np.empty_like(now.crossed))
+        moved = linalg.transpose(transition)
+        step = take(filters.step, place)
+        innovation = take(filters.innovation_covariance, place)
+        ahead = take(filters.predicted_cross, place)
         carried: dict[tuple[int, int], Array] = {}
+        crossed, lag = [], []
         for row, (i, j) in enumerate(_ordered(count)):
             block = linalg.matmul(transition, now.crossed[row])
             carried[i, j] = linalg.matvec(block, filters.measurement_matrix[j])
-            block = linalg.matmul(block, linalg.transpose(transition))
+            block = linalg.matmul(block, moved)
             block -= linalg.outer(carried[i, j], step[j])
             block += linalg.outer(step[i], ahead[i, j])
-            np.multiply(block, silent[i], out=following.crossed[row])
+            block *= silent[i]
+            crossed.append(block)
         for row, (i, j) in enumerate(_pairs(count)):
             if i == j:
                 block = linalg.congruence(transition, now.lag[row])
                 block += linalg.outer(step[i], innovation[i, i] * step[i])
-                np.multiply(block, silent[i], out=following.lag[row])
-                continue
-            block = linalg.matmul(transition, now.lag[row])
-            block = linalg.matmul(block, linalg.transpose(transition))
-            block += linalg.outer(carried[i, j], step[j])
-            block += linalg.outer(step[i], carried[j, i] + innovation[i, j] * step[j])
-            np.multiply(block, silent[i] * silent[j], out=following.lag[row])
-        return following
+                block *= silent[i]
+            else:
+                block = linalg.matmul(transition, now.lag[row])
+                block = linalg.matmul(block, moved)
+                block += linalg.outer(carried[i, j], step[j])
+                block += linalg.outer(step[i], carried[j, i] + innovation[i, j] * step[j])
+                block *= silent[i] * silent[j]
+            lag.append(block)
+        return LagCovariances(_stacked(lag, now.lag), _stacked(crossed, now.crossed))
 
     def prediction(self, now: LagCovariances, place: Times) -> JointPrediction:
         """Return the covariances after the nodes' update at the time with the ``place`` (N,)."""
-        filters, n = self.filters, self.states
-        count, runs = len(filters.gain), len(place)
-        gain = self.gain.take(place, -1)
-        innovation = filters.innovation_covariance.take(place, -1)
-        filtered = self.filtered_cross.take(place, -1)
-        crossed = np.zeros((count, count, n, n, runs))
-        lag = np.empty((count, count, n, n, runs))
+        filters, n, count = self.filters, self.states, len(self.filters.gain)
+        shape = (count, count, n, n, len(place))
+        gain = take(self.gain, place)
+        innovation = take(filters.innovation_covariance, place)
+        filtered = take(self.filtered_cross, place)
+        crossed: dict[tuple[int, int], Array] = {}
+        lag: dict[tuple[int, int], Array] = {}
         observed: dict[tuple[int, int], Array] = {}
         for row, (i, j) in enumerate(_ordered(count)):
             rows = _collapse(now.crossed[row], n)
@@ -169,8 +174,19 @@ class LagRecursion:
             lag[i, j] = block + linalg.outer(gain[i], right)
             if i != j:
                 lag[j, i] = linalg.transpose(lag[i, j])
-        local, floor = self.local.take(place, -1), self.floor.take(place, -1)
-        return JointPrediction(local, crossed, lag, floor)
+        nothing, pairs = np.zeros(shape[2:]), list(np.ndindex(count, count))
+        whole = [
+            _stacked([blocks.get(pair, nothing) for pair in pairs], now.lag).reshape(shape)
+            for blocks in (crossed, lag)
+        ]
+        return JointPrediction(take(self.local, place), whole[0], whole[1], take(self.floor, place))
+
+
+def _stacked(blocks: list[Array], before: Array) -> Array:
+    """Return the blocks as one array, or ``before`` if there are none."""
+    if not blocks:
+        return before
+    return namespace(before).concatenate(blocks).reshape(-1, *blocks[0].shape)
 
 
 def _ordered(count: int) -> list[tuple[int, int]]:

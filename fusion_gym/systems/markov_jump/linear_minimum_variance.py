@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace, take
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 
@@ -276,7 +277,7 @@ class LocalFilters:
     def at(self, time: Times) -> Times:
         """Return the places (N,) of the times (N,) in the tables."""
         beyond = self.length - self.period + (time - self.length) % self.period
-        return np.where(time < self.length, time, beyond)
+        return namespace(time).where(time < self.length, time, beyond)
 
     def predict(self, mean: Array, noise_mean: Array, place: Times) -> Array:
         """Return ζ̂(k+1|k) = Ā ζ̂(k|k) + B̄ ŵ(k|k), (l, a, N), with ``place`` of the time k.
@@ -284,7 +285,7 @@ class LocalFilters:
         Source: markov_jump, equations (16), (36) and, with ŵ = 0, (38).
         """
         moved = linalg.matvec(self.transition, mean)
-        return moved + linalg.matvec(self.input.take(place, -1), noise_mean)
+        return moved + linalg.matvec(take(self.input, place), noise_mean)
 
     def update(
         self, mean: Array, measurement: Array, sampled: NDArray[np.bool_], place: Times
@@ -294,9 +295,9 @@ class LocalFilters:
         Source: markov_jump, equations (12), (13), (17).
         """
         surprise = measurement - linalg.dot(self.measurement_matrix, mean)
-        innovation = np.where(sampled, surprise, 0.0)
-        correction = self.gain.take(place, -1) * innovation[:, None]
-        noise_mean = self.noise_gain.take(place, -1) * innovation[:, None]
+        innovation = namespace(sampled, surprise).where(sampled, surprise, 0.0)
+        correction = take(self.gain, place) * innovation[:, None]
+        noise_mean = take(self.noise_gain, place) * innovation[:, None]
         return FilterUpdate(mean + correction, noise_mean, innovation)
 
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
 from fusion_gym.errors import forbidden
+from fusion_gym.namespace import ndtr, take
 from fusion_gym.systems.linear_plant import covariance_factor, initial_law
 from fusion_gym.validation import ConfigurationError
 
@@ -50,7 +50,7 @@ def draw_mode(cumulative: Array, noise: Array) -> Modes:
         cumulative: cumulative probabilities (values - 1, ...), without the last one.
         noise: standard normals (...).
     """
-    return np.asarray((ndtr(noise) > cumulative).sum(0))
+    return (ndtr(noise) > cumulative).sum(0)
 
 
 @dataclass(frozen=True)
@@ -195,11 +195,11 @@ class MarkovJumpPlant:
 
         Source: markov_jump, equation (3).
         """
-        moved = linalg.matvec(self.transition.take(mode, -1), state)
+        moved = linalg.matvec(take(self.transition, mode), state)
         moved = true_motion(departure, state, moved)
-        return moved + linalg.matvec(self.process_gain.take(mode, -1), process_noise)
+        return moved + linalg.matvec(take(self.process_gain, mode), process_noise)
 
     def jump(self, mode: Modes, noise: Array) -> Modes:
         """Return θ(k+1) (N,) from θ(k) (N,) and standard normals (N,)."""
         cumulative = np.cumsum(self.mode_transition, 1).T[:-1]
-        return draw_mode(cumulative.take(mode, -1), noise)
+        return draw_mode(take(cumulative, mode), noise)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import forbidden
+from fusion_gym.namespace import namespace, take
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw_mode, probabilities
 
 
@@ -116,13 +117,13 @@ class FadingSensors:
 
     def sampled(self, time: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return γ of (4): which sensors measure at the times (N,) >= 1, (sensors, N)."""
-        return np.asarray(time % self.period == 0)
+        return time % self.period == 0
 
     def fading(self, noise: Array) -> Array:
         """Return β (sensors, N) from standard normals (sensors, N)."""
         cumulative = np.cumsum(self.fading_probabilities, 1).T[:-1, :, None]
         place = draw_mode(cumulative, noise)
-        return np.asarray(np.take_along_axis(self.fading_values, place, 1))
+        return namespace(place).take_along_axis(self.fading_values, place, 1)
 
     def measure(self, state: Array, mode: Modes, process_noise: Array, noise: Array) -> Array:
         """Return the measurements (sensors, N) as if all sensors sampled.
@@ -135,7 +136,7 @@ class FadingSensors:
 
         Source: markov_jump, equation (4) with γ = 1.
         """
-        matrix = self.measurement_matrix.take(mode, -1)
+        matrix = take(self.measurement_matrix, mode)
         result = self.fading(noise[: self.count]) * linalg.dot(matrix, state)
         result += linalg.dot(self.noise_coupling, process_noise)
         result += self.deviation * noise[self.count :]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from fusion_gym.core.knowledge import (
     sensed,
 )
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
+from fusion_gym.namespace import namespace, take
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
@@ -193,11 +195,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         return replace(
             state,
             time=time,
-            innovation=np.zeros_like(state.innovation),
+            innovation=np.zeros(state.innovation.shape),
             node_mean=self.filters.predict(state.node_mean, state.node_noise, before),
-            node_noise=np.zeros_like(state.node_noise),
+            node_noise=np.zeros(state.node_noise.shape),
             copy_mean=copy_mean,
-            copy_noise=np.zeros_like(state.copy_noise),
+            copy_noise=np.zeros(state.copy_noise.shape),
             age=state.age + 1.0,
             lags=lags,
             prediction=prediction,
@@ -214,7 +216,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         update = self.filters.update(state.node_mean, measurement[:, 0], sampled, place)
         return replace(
             state,
-            measurement=np.where(sampled[:, None], measurement, np.nan),
+            measurement=namespace(sampled).where(sampled[:, None], measurement, np.nan),
             innovation=update.innovation,
             node_mean=update.mean,
             node_noise=update.noise_mean,
@@ -226,15 +228,15 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         Source: markov_jump, equations (34)-(39), (55)-(57).
         """
         arrived, prediction = reception.arrived, sensed(state.prediction)
-        grant = arrived[:, None]
-        copy_mean = np.where(grant, state.node_mean, state.copy_mean)
+        grant, xp = arrived[:, None], namespace(arrived)
+        copy_mean = xp.where(grant, state.node_mean, state.copy_mean)
         fused = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(arrived))
         return replace(
             state,
             copy_mean=copy_mean,
-            copy_noise=np.where(grant, state.node_noise, state.copy_noise),
-            held=np.where(grant, self._collapse(state.node_mean), state.held),
-            age=np.where(arrived, 0.0, state.age),
+            copy_noise=xp.where(grant, state.node_noise, state.copy_noise),
+            held=xp.where(grant, self._collapse(state.node_mean), state.held),
+            age=xp.where(arrived, 0.0, state.age),
             mean=fused.mean,
             covariance=fused.covariance,
         )
@@ -253,7 +255,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
             "variance_reduction": lambda: self._variance_reduction(state, prediction),
             "centre_variance": lambda: linalg.trace(state.prior_covariance),
             "greedy_variance": lambda: self._greedy_variance(state, prediction),
-            "local_variance": lambda: self.recursion.local_trace.take(place, -1),
+            "local_variance": lambda: take(self.recursion.local_trace, place),
             "sampled": lambda: self.model.sensors.sampled(state.time),
         }
 
@@ -284,11 +286,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
 
     def _whitened_innovation(self, state: MarkovJumpEstimate) -> Array:
         nodes, place = np.arange(self.model.sensors.count), self.filters.at(state.time)
-        variance = self.filters.innovation_covariance[nodes, nodes].take(place, -1)
-        return state.innovation / np.sqrt(variance)
+        variance = take(self.filters.innovation_covariance[nodes, nodes], place)
+        return state.innovation / namespace(variance).sqrt(variance)
 
     def _local_log_deviation(self, state: MarkovJumpEstimate) -> Array:
-        trace = self.recursion.local_trace.take(self.filters.at(state.time), -1)
+        trace = take(self.recursion.local_trace, self.filters.at(state.time))
         return log_deviation(trace[:, None, None], self.reference.sum(keepdims=True))[:, 0]
 
     def _copy_log_deviation(self, state: MarkovJumpEstimate) -> Array:
@@ -299,24 +301,26 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
     def _lag_deviation(self, prediction: JointPrediction) -> Array:
         """Return the predicted deviations (l, n, N) of node minus copy, above zero."""
         nodes = np.arange(self.model.sensors.count)
-        variance = linalg.diagonal(prediction.lag[nodes, nodes])
-        return np.sqrt(np.maximum(variance, (_FLOOR * _FLOOR) * self.reference[:, None]))
+        variance, xp = linalg.diagonal(prediction.lag[nodes, nodes]), namespace(prediction.lag)
+        least = (_FLOOR * _FLOOR) * self.reference[:, None]
+        return xp.sqrt(xp.maximum(variance, least))
 
     def _variance_reduction(self, state: MarkovJumpEstimate, prediction: JointPrediction) -> Array:
         silent, silence = self.trace(state.prior_covariance), np.zeros(state.age.shape, np.bool_)
         each = self._covariances_after_next(state, prediction, silence)
-        return np.stack([silent - self.trace(covariance) for covariance in each])
+        return namespace(silent).stack([silent - self.trace(one) for one in each])
 
     def _greedy_variance(self, state: MarkovJumpEstimate, prediction: JointPrediction) -> Array:
         """Return the trace as sensors join in the order of the largest reduction."""
-        sent = np.zeros(state.age.shape, dtype=np.bool_)
-        sensors, result = np.arange(self.model.sensors.count)[:, None], np.empty(sent.shape)
-        trace = linalg.trace(state.prior_covariance)
+        sent: Any = np.zeros(state.age.shape, dtype=np.bool_)
+        sensors, result = np.arange(len(sent))[:, None], np.zeros(sent.shape)
+        trace, xp = linalg.trace(state.prior_covariance), namespace(state.prior_covariance)
         for _ in range(self.model.sensors.count):
             each = self._covariances_after_next(state, prediction, sent)
-            options = np.where(sent, np.inf, [linalg.trace(covariance) for covariance in each])
+            traces = xp.stack([linalg.trace(covariance) for covariance in each])
+            options = xp.where(sent, np.inf, traces)
             selected = sensors == options.argmin(0)
-            result[selected] = np.broadcast_to(trace, sent.shape)[selected]
+            result = xp.where(selected, trace, result)
             trace, sent = options.min(0), sent | selected
         return result
 
@@ -324,9 +328,6 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         self, state: MarkovJumpEstimate, prediction: JointPrediction, sent: NDArray[np.bool_]
     ) -> list[Array]:
         """Return fused covariances (n, n, N) if ``sent`` (l, N) and one more sensor transmit."""
-        means, each = self._collapse(state.copy_mean), []
-        for sensor in range(self.model.sensors.count):
-            more = sent.copy()
-            more[sensor] = True
-            each.append(self.fusion.fuse(means, prediction.joint(more)).covariance)
-        return each
+        means = self._collapse(state.copy_mean)
+        several = (sent | own[:, None] for own in np.eye(len(sent), dtype=np.bool_))
+        return [self.fusion.fuse(means, prediction.joint(more)).covariance for more in several]

@@ -50,7 +50,6 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
     state_names: tuple[str, ...]
     random_start: bool = False
     nature: Nature = AS_ASSUMED
-    numpy_only = None
 
     @property
     def start_channels(self) -> int:

@@ -9,6 +9,7 @@ Source: unknown_input, equations (24)-(26).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from fusion_gym.fusion.several import (
     covariance_intersection_many,
     is_regular,
 )
+from fusion_gym.namespace import in_runs, namespace, put_runs, set_at
 
 _GAP = 0.01  # relative gap at which the tracked weights rest
 _STEPS = 4  # evaluations of the tracked weights at a time, at most
@@ -63,20 +65,25 @@ class NodeFusion(FusionRule):
         The covariance has zero blocks between state and input. Tracked weights are the state's.
         """
         n, own = self.states, own_covariances(covariance)
+        ranges = slice(n), slice(n, None)
         part = self.state_weights
         every = (None, None) if part is None else (part[:n], part[n:])
         state = self._block(means[:, :n], own[:, :n, :n], active, every[0])
         inputs = self._block(means[:, n:], own[:, n:, n:], active, every[1])
-        joint = np.zeros(own.shape[1:])
-        joint[:n, :n], joint[n:, n:] = state.covariance, inputs.covariance
+        xp, blocks = namespace(means, own), [(..., part, part, slice(None)) for part in ranges]
 
-        def gains() -> Array:
-            both = np.zeros(own.shape)
-            both[:, :n, :n], both[:, n:, n:] = state.gains, inputs.gains
-            return both
+        def joined(*parts: Array) -> Array:
+            whole = xp.zeros((*parts[0].shape[:-3], *own.shape[1:]))
+            for block, part in zip(blocks, parts, strict=True):
+                whole = set_at(whole, block, part)
+            return whole
 
-        mean = np.concatenate((state.mean, inputs.mean))
-        return Fused(mean, joint, gains, state.weights if self.tracked else None)
+        return Fused(
+            xp.concatenate((state.mean, inputs.mean)),
+            joined(state.covariance, inputs.covariance),
+            lambda: joined(state.gains, inputs.gains),
+            state.weights if self.tracked else None,
+        )
 
     def _block(
         self, means: Array, own: Array, active: NDArray[np.bool_] | None, state: Array | None
@@ -123,42 +130,48 @@ def tracked_intersection(
         weights: (l, N), not negative, of sum 1.
         basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
     """
-    information = linalg.inverse(covariance)
+    information, xp = linalg.inverse(covariance), namespace(covariance)
     nodes, n = mean.shape[:2]
     vectors = linalg.matvec(information, mean)
-    weights = np.maximum(weights, _FLOOR)
+    weights = xp.maximum(weights, _FLOOR)
     weights /= linalg.total(weights, 0)
-    lanes: slice | np.ndarray = slice(None)
-    fused = np.empty(covariance.shape[1:])
+    lanes: Any = slice(None)
+    fused = xp.empty_like(covariance[0])
     for step in range(_STEPS):
-        part, some = information[..., lanes], weights[:, lanes]
+        runs = lanes if xp is np else slice(None)  # JAX computes all
+        part, some = information[..., runs], weights[:, runs]
         bound = linalg.inverse(linalg.total(some[:, None, None] * part, 0))
-        fused[..., lanes] = bound
+        fused = put_runs(fused, lanes, bound)
         if step == _STEPS - 1:
             break
-        metric = None if basis is None else basis[..., lanes]
+        metric = None if basis is None else basis[..., runs]
         spread = bound if metric is None else linalg.matmul(bound, linalg.transpose(metric))
         square = linalg.matmul(spread, linalg.transpose(spread))
         gain = linalg.total((part * square).reshape(nodes, n * n, -1))
         total = linalg.trace(bound if metric is None else linalg.matmul(metric, spread))
         still = gain.max(0) > (1.0 + _GAP) * total
-        if not still.any():
-            break
-        lanes = np.flatnonzero(still) if isinstance(lanes, slice) else lanes[still]
-        moved = np.maximum(some[:, still] * np.sqrt(gain[:, still]), _FLOOR**2)
-        weights[:, lanes] = moved / linalg.total(moved, 0)
+        if xp is np:
+            if not still.any():
+                break
+            some, gain = some[:, still], gain[:, still]
+            lanes = np.flatnonzero(still) if isinstance(lanes, slice) else lanes[still]
+        else:
+            lanes = still if isinstance(lanes, slice) else lanes & still
+        moved = xp.maximum(some * xp.sqrt(gain), _FLOOR**2)
+        weights = put_runs(weights, lanes, moved / linalg.total(moved, 0))
     joined = linalg.matvec(fused, linalg.total(weights[:, None] * vectors, 0))
-    lanes = np.flatnonzero(~is_regular(covariance, information).all(0))
-    if lanes.size:
-        own = None if basis is None else basis[..., lanes]
-        best = covariance_intersection_many(mean[..., lanes], covariance[..., lanes], basis=own)
-        joined[:, lanes], fused[..., lanes] = best.mean, best.covariance
-        weights[:, lanes] = best.weights
+    singular: Any = ~is_regular(covariance, information).all(0)
+
+    def best(mean: Array, covariance: Array, basis: Array | None = None) -> tuple[Any, ...]:
+        found = covariance_intersection_many(mean, covariance, basis=basis)
+        return found.mean, found.covariance, found.weights, found.gains
+
+    arguments = (mean, covariance) if basis is None else (mean, covariance, basis)
+    results = joined, fused, weights, xp.zeros(covariance.shape)
+    joined, fused, weights, own = in_runs(singular[None], best, arguments, results)
 
     def gains() -> Array:
         every = linalg.matmul(fused, weights[:, None, None] * information)
-        if lanes.size:
-            every[..., lanes] = best.gains
-        return every
+        return xp.where(singular, own, every)
 
     return Fused(joined, fused, gains, weights)

@@ -18,8 +18,11 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace, set_at, update_at
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.sensors import InputSensors
+
+_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,8 @@ class JointGain:
         through = linalg.matmul(innovation, u)
         weight = linalg.matmul(linalg.transpose(u), through)
         target = -linalg.matmul(self.onto, through)
-        target[:, : cross.shape[1]] += linalg.matmul(cross, u)
+        states = slice(cross.shape[1])
+        target = update_at(np.add, target, (..., states, _ALL, _ALL), linalg.matmul(cross, u))
         if free == 1:  # rounding may make it negative
             choice = target / weight
         else:
@@ -69,10 +73,8 @@ class JointGain:
 
     def covariance(self, gain: Array, covariance: Array, noise: Array) -> Array:
         """Return the covariance M Φ Mᵀ + 𝒢 R 𝒢ᵀ (l, s, s, N) of any such gain, M = [I; 0] - 𝒢 C."""
-        n = covariance.shape[1]
-        moved = -linalg.matmul(gain, self.sensors.measurement_matrix)
-        for row in range(n):
-            moved[:, row, row] += 1.0
+        unit = np.eye(gain.shape[1], covariance.shape[1])[..., None]
+        moved = unit - linalg.matmul(gain, self.sensors.measurement_matrix)
         return linalg.congruence(moved, covariance) + linalg.congruence(gain, noise)
 
 
@@ -141,27 +143,26 @@ class InputModel:
     def predict(self, mean: Array) -> Array:
         """Return F ẑ (..., s, N) from (..., s, N)."""
         n = self.size
-        return np.concatenate(
-            (linalg.matvec(self.state_rows, mean), self.memory * mean[..., n:, :]), axis=-2
-        )
+        parts = linalg.matvec(self.state_rows, mean), self.memory * mean[..., n:, :]
+        return namespace(mean).concatenate(parts, axis=-2)
 
     def predict_covariance(self, covariance: Array) -> Array:
         """Return F P Fᵀ plus the covariance of [ℬ η + w; η], (..., s, s, N)."""
         n = self.size
-        result = np.empty(covariance.shape)
+        states, inputs = slice(n), slice(n, None)
         rows = linalg.matmul(self.state_rows, covariance)
-        result[..., :n, :n, :] = linalg.matmul(rows, linalg.transpose(self.state_rows))
+        upper = linalg.matmul(rows, linalg.transpose(self.state_rows))
         cross = rows[..., n:, :] * self.memory
-        result[..., :n, n:, :] = cross
-        result[..., n:, :n, :] = linalg.transpose(cross)
-        inputs = covariance[..., n:, n:, :] * self.memory
-        inputs *= self.memory[:, None]
-        result[..., n:, n:, :] = inputs
+        lower = covariance[..., n:, n:, :] * self.memory
+        lower *= self.memory[:, None]
+        result = namespace(covariance).empty(covariance.shape)
+        result = set_at(result, (..., states, states, _ALL), upper)
+        result = set_at(result, (..., states, inputs, _ALL), cross)
+        result = set_at(result, (..., inputs, states, _ALL), linalg.transpose(cross))
+        result = set_at(result, (..., inputs, inputs, _ALL), lower)
         result += self.change
-        upper = result[..., :n, :n, :]
-        upper += linalg.transpose(upper).copy()
-        upper *= 0.5
-        return result
+        upper = linalg.symmetrise(result[..., :n, :n, :])
+        return set_at(result, (..., states, states, _ALL), upper)
 
     def without_input(self, covariance: Array) -> Array:
         """Return Φ = 𝒜 Ξ_x 𝒜ᵀ + 𝒲 (..., n, n, N) from the joint covariance (..., s, s, N)."""

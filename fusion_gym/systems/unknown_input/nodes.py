@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace, take
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.filters import ExactInputStateFilter, RandomWalkInputFilter
 from fusion_gym.systems.unknown_input.fusion import NodeFusion
@@ -100,7 +101,8 @@ class Nodes(ABC):
 
     def _predict(self, estimates: Estimates, covariance: Array | None) -> NodePrediction:
         """Return predictions with these covariances (l, s, s, N) of the nodes."""
-        prior = self.model.predict(np.concatenate((estimates.mean, estimates.fused_mean[None])))
+        xp = namespace(estimates.mean)
+        prior = self.model.predict(xp.concatenate((estimates.mean, estimates.fused_mean[None])))
         return NodePrediction(prior[:-1], prior[-1], self.sensors.expect(prior[:-1]), covariance)
 
 
@@ -173,7 +175,8 @@ class TableNodes(Nodes):
         n = self.model.size
         state = linalg.matvec(self._at(self.state_gain, time), mean[:, :n])
         inputs = linalg.matvec(self._at(self.input_gain, time), mean[:, n:])
-        fused = np.concatenate((linalg.total(state, 0), linalg.total(inputs, 0)))
+        parts = linalg.total(state, 0), linalg.total(inputs, 0)
+        fused = namespace(mean).concatenate(parts)
         return Estimates(mean, fused, None, None, None)
 
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
@@ -191,18 +194,18 @@ class TableNodes(Nodes):
         silent = linalg.weighted_trace(self.fused, weights)
         reduction = silent - linalg.weighted_trace(self.delivered, weights)
         rows = self._rows(time)
-        return silent[rows], reduction[:, rows]
+        return take(silent, rows), take(reduction, rows)
 
     def _rows(self, time: Array) -> NDArray[np.intp]:
-        return np.minimum(time, self.fused.shape[-1] - 1).astype(np.intp)
+        last = self.fused.shape[-1] - 1
+        return namespace(time).minimum(time, last).astype(np.intp)
 
     def _at(self, table: Array, time: Array) -> Array:
         """Return the table's entry at every run's time, or one column if all times are equal."""
         rows = self._rows(time)
-        first = int(rows[0])
-        if (rows == first).all():
+        if namespace(rows) is np and (rows == (first := int(rows[0]))).all():
             return table[..., first : first + 1]
-        return table.take(rows, axis=-1)
+        return take(table, rows)
 
 
 @dataclass(frozen=True)
@@ -244,7 +247,8 @@ class RunNodes(Nodes):
         if self.hold_variance is None:
             grant = granted[:, None]
             correction *= grant
-            covariance = np.where(grant[:, None], covariance, _own(prediction.covariance))
+            own = _own(prediction.covariance)
+            covariance = namespace(granted).where(grant[:, None], covariance, own)
         mean = prediction.mean + correction
         fused = self.fusion.going_on(estimates.weights).fuse(mean, covariance)
         return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
+from fusion_gym.namespace import ndtr
 from fusion_gym.systems.linear_plant import LinearDynamics, covariance_factor, initial_law
 from fusion_gym.systems.unknown_input.signals import InputSignal
 

@@ -12,10 +12,10 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.namespace import namespace, ndtr, take
 
 
 class InputSignal(ABC):
@@ -118,7 +118,7 @@ class Sinusoids(InputSignal):
     def value(self, memory: Array, time: Array) -> Array:
         """Return the input (q, N) at the runs' times (N,)."""
         angle = memory.reshape(*self.amplitude.shape[:2], -1) + (2.0 * np.pi / self.period) * time
-        return linalg.total(self.amplitude * np.sin(angle), 1)
+        return linalg.total(self.amplitude * namespace(angle).sin(angle), 1)
 
     def mean(self, horizon: int) -> Array:
         """Return zero (horizon, q) for random phases, else the signal itself."""
@@ -216,7 +216,8 @@ class Steps(_Stationary):
     def advance(self, memory: Array, noise: Array) -> Array:
         """Return the levels (q, N) one instant later."""
         jump = ndtr(noise[: self.size]) * self.period < 1.0
-        return np.where(jump, self.amplitude * noise[self.size :], memory)
+        level = self.amplitude * noise[self.size :]
+        return namespace(noise).where(jump, level, memory)
 
     def covariance(self, horizon: int) -> Array:
         """Return (horizon, q, q): a² (1 - 1/period)^lag on the diagonal."""
@@ -279,8 +280,8 @@ class ArrayInput(InputSignal):
 
     def value(self, memory: Array, time: Array) -> Array:
         """Return the rows (q, N) of the runs' times (N,)."""
-        rows = np.minimum(time.astype(np.intp), len(self.values) - 1)
-        return np.ascontiguousarray(self.values[rows, :, 0].T)
+        rows = namespace(time).minimum(time.astype(np.intp), len(self.values) - 1)
+        return take(self.values[..., 0].T, rows)
 
     def mean(self, horizon: int) -> Array:
         """Return the rows (horizon, q)."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
@@ -23,6 +22,7 @@ from fusion_gym.core.knowledge import (
     sensed,
 )
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.namespace import namespace, ndtr
 from fusion_gym.systems.linear_plant import largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
@@ -76,7 +76,7 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         state = self.dynamics.start(noise[:n])
         first = true_noise(departure, noise[:0], noise[n : n + count])[1]
         return UnknownInputTruth(
-            truth=np.concatenate((state, np.zeros((self.dynamics.inputs, runs)))),
+            truth=namespace(noise).concatenate((state, np.zeros((self.dynamics.inputs, runs)))),
             signal=self.signal.start(noise[n + count :]),
             time=np.zeros(runs),
             measurement=self.sensors.measure(state, first),
@@ -96,7 +96,7 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         moved = self.dynamics.advance(last, inputs, process, departure)
         return replace(
             state,
-            truth=np.concatenate((moved, inputs)),
+            truth=namespace(moved, inputs).concatenate((moved, inputs)),
             signal=self.signal.advance(state.signal, noise[:drawn]),
             time=state.time + 1.0,
             measurement=self.sensors.measure(moved, own),
@@ -255,11 +255,12 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
         Source: unknown_input, equations (8), (24), (25).
         """
         prediction, arrived = sensed(state.prediction), reception.arrived
-        held = np.where(arrived[:, None], state.measurement, state.held)
+        xp = namespace(arrived)
+        held = xp.where(arrived[:, None], state.measurement, state.held)
         return replace(
             state,
             held=held,
-            age=np.where(arrived, 0.0, state.age),
+            age=xp.where(arrived, 0.0, state.age),
             estimates=self.nodes.update(state.estimates, prediction, held, arrived, state.time),
         )
 
@@ -304,7 +305,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
         for column in range(1, n):
             variance += spread[..., column, :] * sensors.measurement_matrix[..., column, :]
         variance += linalg.diagonal(sensors.covariance)
-        return np.sqrt(variance, out=variance)
+        return variance**0.5
 
     @functools.cached_property
     def _noise_deviation(self) -> Array:
@@ -330,4 +331,4 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
 
 def _lanes(value: Array, runs: int) -> Array:
     """Broadcast one column for all runs, or one for each, to (..., runs)."""
-    return np.broadcast_to(value, (*value.shape[:-1], runs))
+    return namespace(value).broadcast_to(value, (*value.shape[:-1], runs))
