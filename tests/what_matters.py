@@ -110,7 +110,7 @@ def forgotten(batch: EpisodeBatch) -> EpisodeBatch:
     """Without what was measured and not sent."""
     states = batch.memory.states
     memory = Memory(dataclasses.replace(batch.task, memory_estimator=None), batch.memory.owner)
-    states = {name: state for name, state in states.items() if name == "single"}
+    states = {name: state for name, state in states.items() if name.startswith("single")}
     return with_states(batch, batch.state, memory.with_states(states))
 
 

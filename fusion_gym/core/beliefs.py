@@ -21,7 +21,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,6 @@ from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import covariance_intersection
-
-if TYPE_CHECKING:
-    from fusion_gym.core.memory import Memory
 
 Owner = Literal["scheduler", "own"]
 Packets = NDArray[np.bool_]
@@ -80,21 +77,27 @@ class MemoryPart(NamedTuple):
 MemoryStates = dict[str, Any]
 
 
-def whole_states(
-    parts: Mapping[str, MemoryPart],
-    states: MemoryStates,
-    places: NDArray[np.int64] | None,
-    num_envs: int,
-) -> MemoryStates:
-    """Return states with a column for each run."""
-    result = dict(states)
-    for name, state in states.items():
-        part = parts[name]
-        if part.shared and (places is not None or part.estimator.covariance_fields):
-            columns = np.arange(num_envs) if places is None else places
-            width = state.measurement.shape[-1] // part.copies
-            result[name] = take_runs(state, part.places(columns, width))
-    return result
+class MemoryColumns(NamedTuple):
+    """The parts of a memory, their states, and the columns ``places`` (N,) of the runs.
+
+    Shared states have one column for all runs with the same noise; without ``places`` every run
+    has its own.
+    """
+
+    parts: Mapping[str, MemoryPart]
+    states: MemoryStates
+    places: NDArray[np.int64] | None
+
+    def whole(self, num_envs: int) -> MemoryStates:
+        """Return the states with a column for each of the ``num_envs`` runs."""
+        result = dict(self.states)
+        for name, state in self.states.items():
+            part = self.parts[name]
+            if part.shared and (self.places is not None or part.estimator.covariance_fields):
+                columns = np.arange(num_envs) if self.places is None else self.places
+                width = state.measurement.shape[-1] // part.copies
+                result[name] = take_runs(state, part.places(columns, width))
+        return result
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class Beliefs(ABC):
     Args:
         task: The task.
         estimate: The estimator's state after observing.
-        memory: The owner's memory.
+        memory: The owner's memory states.
         arrival: Probability (sensors, N) that a packet sent now arrives; ``None`` is 1.
         best: x*, if it is known.
     """
@@ -137,7 +140,7 @@ class Beliefs(ABC):
         self,
         task: Task,
         estimate: Any,
-        memory: Memory,
+        memory: MemoryColumns,
         arrival: Array | None,
         best: Estimate | None = None,
     ) -> None:
@@ -145,7 +148,7 @@ class Beliefs(ABC):
             vars(self)["best"] = best
         self.task, self.arrival = task, arrival
         self._estimate, self._runs = estimate, estimate.measurement.shape[-1]
-        self._parts, self._states, self._places = memory.parts, memory.states, memory.places
+        self._memory, (self._parts, self._states, self._places) = memory, memory
 
     @property
     @abstractmethod
@@ -174,7 +177,7 @@ class Beliefs(ABC):
     @cached_property
     def memory_states(self) -> MemoryStates:
         """Memory states with a column for each run."""
-        return whole_states(self._parts, self._states, self._places, self._runs)
+        return self._memory.whole(self._runs)
 
     def update(self, estimator: Estimator[Any], state: Any, packets: Packets) -> Any:
         """Return the state after the arrival of these packets (sensors, …) and no others."""
@@ -185,8 +188,11 @@ class Beliefs(ABC):
 
     def _of_parts(self, kind: str, updated: MemoryStates) -> Estimate:
         """Return the estimates of the parts of one kind, one after another."""
-        parts = ((name, part) for name, part in self._parts.items() if name.startswith(kind))
-        each = [self._of_part(part, updated[name]) for name, part in parts]
+        each = [
+            self._of_part(self._parts[name], state)
+            for name, state in updated.items()
+            if name.startswith(kind)
+        ]
         if len(each) == 1:
             return each[0]
         return Estimate(
@@ -265,7 +271,7 @@ class SchedulerBeliefs(Beliefs):
     @property
     def memory_posterior(self) -> Any:
         """Memory state after the update, with a column for each run."""
-        return whole_states(self._parts, self.posteriors, self._places, self._runs)["every"]
+        return self._memory._replace(states=self.posteriors).whole(self._runs).get("every")
 
     @cached_property
     def _silent(self) -> Any:
@@ -302,7 +308,7 @@ class OwnBeliefs(Beliefs):
     def sent(self) -> Estimate:
         """x̂(s), the centre's estimate if only the packet of s arrives, as sensor s knows it."""
         estimator, sensors = self.task.estimator, self.task.sensors
-        if any(name.startswith("single") for name in self._parts):
+        if any(name.startswith("single") for name in self._states):
             own = self._single(sent=True)
             return own if self.task.broadcast == "none" else _joined(self.silent, own)
         single = estimator.single_deliveries(self._estimate)
@@ -325,10 +331,11 @@ class OwnBeliefs(Beliefs):
     def _single(self, sent: bool) -> Estimate:
         """Return the estimates of the centre after each sensor's own packet, or none."""
         updated = {}
-        for name, part in self._parts.items():
+        for name, state in self._states.items():
             if name.startswith("single"):
-                packets = part.itself(self._states[name]) & sent
-                updated[name] = self.update(part.estimator, self._states[name], packets)
+                part = self._parts[name]
+                packets = part.itself(state) & sent
+                updated[name] = self.update(part.estimator, state, packets)
         self._known[sent] = updated
         return self._of_parts("single", updated)
 

@@ -24,12 +24,12 @@ from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.beliefs import (
     Beliefs,
     Estimate,
+    MemoryColumns,
     MemoryPart,
     MemoryStates,
     OwnBeliefs,
     Owner,
     SchedulerBeliefs,
-    whole_states,
 )
 from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.task import Task
@@ -172,7 +172,7 @@ class Memory:
 
     def whole(self, num_envs: int) -> MemoryStates:
         """Return the states with a column for each of the ``num_envs`` runs."""
-        return whole_states(self.parts, self.states, self.places, num_envs)
+        return self._columns.whole(num_envs)
 
     def branch(self, runs: NDArray[np.int64] | None, num_envs: int) -> Self:
         """Return an independent memory of ``runs`` of the ``num_envs`` runs, by default of all."""
@@ -211,12 +211,16 @@ class Memory:
         self, estimate: Any, arrival: Array | None, best: Estimate | None = None
     ) -> Beliefs:
         kind = OwnBeliefs if self.owner == "own" else SchedulerBeliefs
-        return kind(self.task, estimate, self, arrival, best)
+        return kind(self.task, estimate, self._columns, arrival, best)
+
+    @property
+    def _columns(self) -> MemoryColumns:
+        return MemoryColumns(self.parts, self.states, self.places)
 
     def _updated(self, beliefs: Beliefs, arrived: NDArray[np.bool_]) -> MemoryStates:
         result, own = {}, cast(OwnBeliefs, beliefs)
-        for name, part in self.parts.items():
-            state = self.states[name]
+        for name, state in self.states.items():
+            part = self.parts[name]
             if part.private:
                 result[name] = beliefs.posteriors[name]
                 continue

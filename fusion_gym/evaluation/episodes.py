@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.policy_batch import Together, seeded
 from fusion_gym.fusion.diagonal import orthonormalise
 from fusion_gym.policies.base import Policy, decide, owner_of
 
-_EPISODE_MEANS = ("mse", "error_cost", "bound_trace", "nees", "tokens", "denied", "diverged")
 Progress = Callable[[int], Any] | None
 BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on the machine
 
@@ -181,9 +181,18 @@ def _joined(parts: Sequence[EpisodeResults]) -> EpisodeResults:
     return EpisodeResults(**joined, squared_error=np.asarray(error))
 
 
-def _normalised_error(task: Task, state: Any, error: Array, covariance: Array) -> Array:
+class _Step(NamedTuple):
+    """A step of N runs: the batch after it, its outcome, and the claimed covariance."""
+
+    batch: EpisodeBatch
+    outcome: Outcome
+    covariance: Array
+
+
+def _normalised_error(step: _Step) -> Array:
     """Return eᵀ P⁺ e over the rank of P (N,), of the known truths alone."""
-    available = task.plant.available(state.plant)
+    error, covariance = step.outcome.error, step.covariance
+    available = step.batch.task.plant.available(step.batch.delivered.plant)
     if available is not None:
         known = available[1]
         covariance = np.where(known[:, None] & known, covariance, np.eye(len(known))[..., None])
@@ -198,26 +207,33 @@ def _normalised_error(task: Task, state: Any, error: Array, covariance: Array) -
     return result
 
 
+# Fields of EpisodeResults that are means over an episode's steps, as functions of a step.
+_MEANS: dict[str, Callable[[_Step], NDArray[Any]]] = {
+    "mse": lambda step: step.outcome.squared_error.sum(0),
+    "error_cost": lambda step: -step.outcome.reward_error,
+    "bound_trace": lambda step: linalg.trace(step.covariance),
+    "nees": _normalised_error,
+    "tokens": lambda step: step.outcome.cost,
+    "denied": lambda step: (step.outcome.requested & ~step.outcome.granted).sum(0),
+    "diverged": lambda step: step.outcome.diverged,
+}
+
+
 def _results(
     batch: EpisodeBatch, policy: Policy, seed: int, parts: int = 1, progress: Progress = None
 ) -> list[EpisodeResults]:
     """Run an episode of all runs of a batch, and return the results of its equal parts."""
     task, runs = batch.task, batch.num_envs
     horizon, sensors, episodes = task.horizon, task.sensors, runs // parts
-    means = {name: np.zeros(runs) for name in _EPISODE_MEANS}
+    means = {name: np.zeros(runs) for name in _MEANS}
     rate, requests = np.zeros((sensors, runs)), np.zeros((sensors, runs))
     returns, squared_error = np.zeros(runs), []
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
         covariance = task.estimator.covariance(batch.delivered.estimate)
         squared_error.append(outcome.squared_error.reshape(-1, parts, episodes).mean(-1))
-        means["mse"] += outcome.squared_error.sum(0)
-        means["bound_trace"] += linalg.trace(covariance)
-        means["nees"] += _normalised_error(task, batch.delivered, outcome.error, covariance)
-        means["tokens"] += outcome.cost
-        means["denied"] += (outcome.requested & ~outcome.granted).sum(0)
-        means["error_cost"] -= outcome.reward_error
-        means["diverged"] += outcome.diverged
+        for name, mean in _MEANS.items():
+            means[name] += mean(_Step(batch, outcome, covariance))
         rate += outcome.granted
         requests += outcome.requested
         returns += outcome.reward

@@ -395,11 +395,13 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         if self.level is None:
             return values
         level, available = self._level(state, state.time), cast(Any, state.available)
-        for name in ("measurement", "held", "expected_measurement"):
-            values[name] = np.asarray(values[name]) + level
-        values["sampled"] = available
-        values["variance_reduction"] = lambda: np.where(available, variances()[1], 0.0)
-        return values
+        moved = ("measurement", "held", "expected_measurement")
+        return {
+            **values,
+            **{name: np.asarray(values[name]) + level for name in moved},
+            "sampled": available,
+            "variance_reduction": lambda: np.where(available, variances()[1], 0.0),
+        }
 
     def _level(self, state: CensoredEstimate, time: Array) -> Array:
         level: Any = self.level
