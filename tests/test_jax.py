@@ -205,7 +205,7 @@ def test_parameters_may_be_mapped() -> None:
     ("name", "options", "field"),
     [
         ("TobitOscillator-v1", {"memory": True}, "memory"),
-        ("TobitOscillator-v1", {"fusion": "ci"}, "fusion"),
+        ("LinearFusion-v2", {"filter": "hold"}, "filter"),
         ("LinearFusion-v2", {"true_process_noise": 2.0}, "true_process_noise"),
         ("LinearFusion-v2", {"error": "numpy:trace"}, "error"),
     ],

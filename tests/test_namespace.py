@@ -148,6 +148,7 @@ TASKS: list[tuple[str, dict[str, Any]]] = [
 ]
 # They compile long.
 SLOW_TASKS: list[tuple[str, dict[str, Any]]] = [
+    ("TobitOscillator-v1", {"filter": "tobit", "fusion": "sici"}),
     ("CorrelatedTracking-v1", {"fusion": "ci", "state_weights": (1.0, 2.0, 3.0)}),
     ("CorrelatedTracking-v1", {"fusion": "sci", "order": (2, 0, 1), "track_actual": True}),
     ("UnknownInput-v1", {}),

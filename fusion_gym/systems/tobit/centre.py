@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import forbidden
-from fusion_gym.fusion.rules import FusionRule, InformationFusion
+from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.filters import (
@@ -175,11 +175,6 @@ class FeedbackCentre(NodeCentre):
     """
 
     fusion: FusionRule
-
-    @property
-    def numpy_only(self) -> str | None:
-        """See :class:`Centre`."""
-        return None if isinstance(self.fusion, InformationFusion) else "fusion"
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`."""
