@@ -14,7 +14,7 @@ from typing import Any
 from joblib import Memory
 
 import fusion_gym
-from fusion_gym.output.folders import fingerprint
+from fusion_gym.output.files import fingerprint
 from fusion_gym.validation import ConfigurationError
 
 Function = Callable[..., Any]

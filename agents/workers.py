@@ -22,7 +22,7 @@ from agents.cache import Cache
 from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden
 from fusion_gym.output.ending import name_user_code
-from fusion_gym.output.folders import fingerprint
+from fusion_gym.output.files import fingerprint
 from fusion_gym.output.progress import progress_bar
 from fusion_gym.validation import ConfigurationError
 

@@ -6,9 +6,8 @@ VALIDATION = range(500_000_000, 600_000_000)  # during a training
 TUNING = range(600_000_000, 700_000_000)  # thresholds of the benchmark's rules
 FIELD = range(700_000_000, 800_000_000)  # rules of a study of a log
 CALIBRATION = range(800_000_000, 900_000_000)  # agents at every price
-CROSS_TERM = range(900_000_000, 950_000_000)  # a training's warning
 EXPORT = range(950_000_000, 1_000_000_000)  # the check of an ONNX file
 # Training of agents and search of rules: no figure is measured on the seeds of either. A training
-# begins at TRAINING[STRIDE * seed], the second of two searches at TRAINING[SECOND].
-STRIDE, SECOND = 10_000_019, 10**9
+# begins at TRAINING[STRIDE * seed].
+STRIDE = 10_000_019
 TRAINING = range(1_000_000_000, 1_000_000_000 + STRIDE * 2**32)

@@ -2,13 +2,14 @@
 
 import csv
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, get_args, get_type_hints
 
 import pydantic
 
-from agents.benchmark.tables import KINDS
+from agents.benchmark.report import Results
 
 Row = TypeVar("Row")
+KINDS = {get_args(rows)[0]: name for name, rows in get_type_hints(Results).items()}
 
 
 def read_rows(folder: Path, kind: type[Row]) -> list[Row]:

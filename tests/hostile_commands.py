@@ -84,8 +84,8 @@ POLICIES = [
     "model:", "model:absent.zip", "model:text", "model:folder", "model:latin", "zoo:", "zoo:nobody",
     "zoo:remote_estimation_scheduler,price=-1", "innovation_threshold:threshold={[]:1}",
     "innovation_threshold:threshold=" + "(" * 300, "whittle:price=-1", ":", "=",
-    "lookahead:steps=0", "lookahead:steps=1000000000", "periodic:period=" + "9" * 30,
-    "rollout:samples=1000000000,base=never", "lookahead:steps=1000000000", "os:abort",
+    "rollout:steps=0,base=never", "rollout:steps=1000000000,base=never", "os:abort",
+    "rollout:samples=1000000000,base=never", "periodic:period=" + "9" * 30,
     "periodic_optimum:period=1000000000,packets=500000000", "always\0", "nothing\x1b[0m",
 ]  # fmt: skip
 SETTINGS = [

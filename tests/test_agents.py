@@ -24,8 +24,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run as train
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
-from fusion_gym.training.sweeps import Sweep, SweepSettings
+from fusion_gym.training.config import Experiment, Sweep, SweepSettings
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent

@@ -1,9 +1,11 @@
 """What other requests would have brought: the steps that would have been, and nothing moves."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from training_configs import small_config
 
 import fusion_gym
 from fusion_gym.core.alternatives import Alternatives, alternatives
@@ -13,6 +15,9 @@ from fusion_gym.core.runs import Branch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv, make_sb3_vec_env, reference_estimator
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.run import make_env
 from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR = "fusion_gym/TobitOscillator-v1"
@@ -268,3 +273,24 @@ def test_rewards_without_what_no_policy_changes(kind: str) -> None:
 def test_another_training_error_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="training_error = 'trace' is not allowed"):
         make_sb3_vec_env(OSCILLATOR, 4, training_error="trace")
+
+
+def test_a_memory_that_is_there_is_the_reference_and_changes_no_reward(tmp_path: Path) -> None:
+    options = {"filter": "tobit", "horizon": 30, "memory": True, "memory_filter": "adf"}
+    training = {"timesteps": 64, "num_envs": 4, "error": "mismatch"}
+    environment = {"id": OSCILLATOR, "options": options}
+    experiment = load_checked(
+        Experiment, small_config(tmp_path, environment=environment, training=training)
+    )
+    task = fusion_gym.make_task(OSCILLATOR, **options)
+    env = make_env(experiment, task)
+    assert env.batch.reference is task.memory_estimator
+
+    def rewards(env: Any) -> list[Any]:
+        env.seed(5)
+        env.reset()
+        return [env.step(np.eye(4, 3, k=step % 3 - 1, dtype=np.int8))[1] for step in range(40)]
+
+    other = reference_estimator(OSCILLATOR, options)
+    apart = PrivilegedVecEnv(task, 4, error="mismatch", reference=other, stagger=True)
+    np.testing.assert_array_equal(rewards(env), rewards(apart))

@@ -262,7 +262,7 @@ def test_calls(call: Callable[[], Any], parts: tuple[str, ...]) -> None:
         ("dynamic_event:threshold=0.1/-1/0.3", ("threshold = (0.1, -1, 0.3)", ">= 0")),
         ("information_gain:threshold=0.1/0.2/0.3,at_most=none", ("threshold = (0.1, 0.2, 0.3)",)),
         ("innovation_threshold:at_most=0", ("at_most = 0", "whole number >= 1")),
-        ("lookahead:price=-1", ("price = -1",)),
+        ("rollout:price=-1,base=never", ("price = -1",)),
         ("round_robin:period=2.5", ("period = 2.5", "whole number >= 1")),
         ("model:", ("model ''", "no such file")),
         ("model:nowhere/agent.zip", ("'nowhere/agent.zip'", "no such file")),

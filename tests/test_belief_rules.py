@@ -14,9 +14,11 @@ from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.rules.estimate_difference import EstimateDifference
-from fusion_gym.policies.rules.kullback_leibler import KullbackLeibler
-from fusion_gym.policies.rules.value_of_information import ValueOfInformation
+from fusion_gym.policies.rules.beliefs import (
+    EstimateDifference,
+    KullbackLeibler,
+    ValueOfInformation,
+)
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"

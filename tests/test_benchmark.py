@@ -121,8 +121,6 @@ def test_a_policy_of_ones_own_has_the_same_verdict(small: list[str]) -> None:
     error = refusal("benchmark", [*small, "--policy", text, "--class", "centre"])
     assert "it declares knowledge = 'scheduler', and the class has 'centre'" in error
     assert "class = None is not allowed" in refusal("benchmark", [*small, "--policy", text])
-    both = refusal("benchmark", [*small, "--second-search", "--policy", text, "--class", "local"])
-    assert "second_search = True is not allowed" in both
 
 
 def test_the_make_target_is_a_command() -> None:
@@ -130,16 +128,6 @@ def test_the_make_target_is_a_command() -> None:
     _, words = makefile.split("python -m agents.benchmark", 1)
     error = refusal("benchmark", [*words.splitlines()[0].split(), "--settings", "nowhere"])
     assert "settings = 'nowhere' is not allowed" in error
-
-
-def test_a_second_search_has_other_episodes_and_more_of_them(
-    small: list[str], tmp_path: Path
-) -> None:
-    printed = succeed("benchmark", [*small, "--second-search"]).out
-    assert sum("second" in line for line in printed.splitlines()) >= 3
-    searches = [json.loads(path.read_text()) for path in (tmp_path / "work").rglob("*000000.json")]
-    assert sorted(map(len, searches)) == [2, 2, 2, 8, 8, 8]
-    assert len({json.dumps(generations[0]) for generations in searches}) == 6
 
 
 def test_one_seed_has_the_interval_of_students_test() -> None:

@@ -19,7 +19,7 @@ from fusion_gym.commands.command_line import Command
 from fusion_gym.core.reward import Price
 from fusion_gym.output.ending import report_errors
 from fusion_gym.policies.settings import parse_value
-from fusion_gym.training.sweeps import SweepCurve
+from fusion_gym.training.config import SweepCurve
 from fusion_gym.validation import ConfigurationError
 
 PER_OPTION = 2  # of the tries that run each time

@@ -18,9 +18,9 @@ import fusion_gym
 from agents.benchmark.command import Benchmark
 from fusion_gym.commands import __main__ as everything
 from fusion_gym.commands import command_line
+from fusion_gym.commands.info import plain_text
 from fusion_gym.commands.train import Train
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
-from fusion_gym.output.plain import plain_text
 from fusion_gym.policies.card import ALGORITHMS
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.catalogue import catalogue

@@ -17,8 +17,7 @@ from fusion_gym.training import run
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.counterfactual import CounterfactualPPO, RolloutBatch, _Step
-from fusion_gym.training.decisions import Decisions
+from fusion_gym.training.counterfactual import CounterfactualPPO, Decisions, RolloutBatch, _Step
 from fusion_gym.validation import ConfigurationError
 
 RUNS = 5

@@ -16,8 +16,7 @@ from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.envelope import compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode, run_episodes
-from fusion_gym.evaluation.intervals import mean_interval
-from fusion_gym.evaluation.metrics import METRICS, paired_difference, summarise
+from fusion_gym.evaluation.metrics import METRICS, mean_interval, paired_difference, summarise
 from fusion_gym.policies.registry import make_policy
 
 ENV_ID = "fusion_gym/TobitOscillator-v1"

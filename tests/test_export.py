@@ -23,7 +23,7 @@ from fusion_gym.commands.export import Export, export, spec
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.onnx_check import onnx_agreement
+from fusion_gym.evaluation.onnx_export import onnx_agreement
 from fusion_gym.policies.base import owner_of
 from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy, tag_model

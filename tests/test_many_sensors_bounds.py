@@ -12,9 +12,9 @@ from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers import solve_ages, solve_task
+from fusion_gym.solvers.source import TokenLevels
 from fusion_gym.solvers.task import source_problems
-from fusion_gym.solvers.tokens import TokenLevels
-from fusion_gym.training.decisions import Decisions
+from fusion_gym.training.counterfactual import Decisions
 from fusion_gym.validation import ConfigurationError
 
 MANY = 200
@@ -55,10 +55,6 @@ def test_two_hundred_sensors_run_under_every_rule_that_is_no_worse_than_square()
 REFUSED: dict[str, tuple[Any, str]] = {
     "joint": (lambda: linear(101, filter="joint"), r"'joint'.*101 sensors.*at most 100.*'kalman'"),
     "ci": (lambda: linear(41, fusion="ci"), r"'ci'.*41 sensors.*at most 40.*'sci'"),
-    "lookahead": (
-        lambda: make_policy("lookahead:price=0.1", linear(41)),
-        r"sensors = 41.*'lookahead'.*at most 40.*'value_of_information'",
-    ),
     "discrete": (lambda: linear(17, action="discrete"), r"'discrete'.*17 sensors.*at most 16"),
     "periodic_optimum": (
         lambda: make_policy("periodic_optimum:packets=3,period=2", linear(MANY)),
@@ -89,8 +85,6 @@ def test_up_to_their_bounds_they_are_not_refused() -> None:
     linear(40, fusion="ci")
     linear(41, fusion="sci")
     linear(16, action="discrete")
-    with pytest.warns(UserWarning, match="one transmission after another"):
-        make_policy("lookahead:price=0.1", linear(40))
 
 
 @pytest.mark.parametrize("action", ["binary", "discrete"])

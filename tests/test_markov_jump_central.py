@@ -19,8 +19,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.rules.constant import Always
-from fusion_gym.policies.rules.random import Random
+from fusion_gym.policies.rules.schedules import Always, Random
 
 build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")
 

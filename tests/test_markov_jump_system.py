@@ -11,8 +11,7 @@ from rules import make_rule
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.rules.centre_variance import CentreVariance
-from fusion_gym.policies.rules.local_variance import LocalVariance
+from fusion_gym.policies.rules.schedules import CentreVariance, LocalVariance
 
 build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusion_gym import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.paced import Paced
+from fusion_gym.policies.rules.schedules import Paced
 
 ENV_ID = "fusion_gym/TobitOscillator-v1"
 LENGTH = 400

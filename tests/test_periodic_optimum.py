@@ -16,7 +16,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies import periodic_optimum
 from fusion_gym.policies.periodic_optimum import PeriodicOptimum, steady_traces
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.random import Random
+from fusion_gym.policies.rules.schedules import Random
 from fusion_gym.validation import ConfigurationError
 
 ENV_ID = "fusion_gym/MarkovJumpTracking-v1"

@@ -29,7 +29,6 @@ from fusion_gym.core.memory import Owner
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import read
 from fusion_gym.evaluation import record_episode, run_episodes, watch
-from fusion_gym.evaluation.cross_term import cross_terms
 from fusion_gym.evaluation.episodes import run_priced, run_several
 from fusion_gym.policies.base import Rule
 from fusion_gym.policies.belief_rule import BeliefRule
@@ -88,7 +87,6 @@ POLICIES: dict[str, list[str]] = {
     ],
     "kullback_leibler": ["threshold=0.3,at_most=1", "threshold=0.3,own=true"],
     "local_variance": ["", "m=0.3"],
-    "lookahead": ["price=0.02,steps=1"],
     "model": [f"{zoo.model_path('tobit_oscillator_centre')}"],
     "optimal": ["", "criterion=average"],
     "periodic": ["", "period=3,staggered=false"],
@@ -236,7 +234,6 @@ def loops(task: Task, policy: Any) -> dict[str, Callable[[], Any]]:
         "record": lambda: record_episode(task, policy, 0),
         "search": lambda: run_priced(task, policy, np.arange(2), np.ones(2)),
         "several": lambda: run_several(task, [policy, policy], 2, 0),
-        "cross term": lambda: cross_terms(task, task.estimator, {"policy": policy}, 2, 0),
         "watch": lambda: list(watch(task, {"policy": policy}, steps=1)),
         "papers": lambda: next(walk(task, policy, 2, 0)),
     }

@@ -21,7 +21,7 @@ from agents.papers.unknown_input_recursion import gains, models
 from agents.papers.walk import SomeSensors
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
-from fusion_gym.evaluation.intervals import Interval
+from fusion_gym.evaluation.metrics import Interval
 
 SEED = 1_000_000
 

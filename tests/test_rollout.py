@@ -164,8 +164,10 @@ def test_the_base_is_the_rest_of_the_text() -> None:
     assert (policy.samples, policy.steps, policy.price) == (2, 3, None)
     assert (policy.base.threshold, policy.base.at_most) == (0.03, 1)
     assert policy.knowledge == "scheduler_memory"
-    nested: Any = make_policy("rollout:samples=1,steps=1,base=lookahead:price=0.1,steps=2", task)
-    assert (nested.base.price, nested.base.steps) == (0.1, 2)
+    nested: Any = make_policy(
+        "rollout:samples=1,steps=1,base=value_of_information:price=0.1,at_most=2", task
+    )
+    assert (nested.base.price, nested.base.at_most) == (0.1, 2)
     free = make_policy("rollout:samples=2,steps=1,price=0,base=never", task)
     dear = make_policy("rollout:samples=2,steps=1,price=1e9,base=never", task)
     assert run_episodes(task, dear, 3, 0).rate.max() == 0.0

@@ -13,9 +13,8 @@ from scipy.optimize import brentq
 from fusion_gym.arrays import Array
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.evaluation.metrics import mean_interval
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.silence import (
     SilenceProblem,
     cost_bound,
@@ -27,7 +26,7 @@ from fusion_gym.solvers.silence import (
 from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, margins, spread_values
 from fusion_gym.solvers.silence.survival import Survival
 from fusion_gym.solvers.single import solve_finite
-from fusion_gym.solvers.source import SourceProblem
+from fusion_gym.solvers.source import ErrorGrid, SourceProblem
 from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR: dict[str, Any] = {"filter": "tobit", "random_start": True, "horizon": 20}
@@ -132,7 +131,7 @@ def oscillator_bound() -> Any:
         ("innovation_threshold:threshold=2,at_most=1", "unlimited"),
         ("innovation_threshold:threshold=3", "unlimited"),
         ("periodic:period=12", "unlimited"),
-        ("lookahead:steps=1,price=0.02", "limited"),
+        ("value_of_information:price=0.02", "limited"),
     ],
 )
 def test_never_above_the_interval_of_a_policy(policy: str, tokens: str) -> None:

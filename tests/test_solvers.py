@@ -16,13 +16,15 @@ from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.solvers.ages import solve_ages
-from fusion_gym.solvers.bounds import lagrangian_bound
-from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
-from fusion_gym.solvers.single import solve_average, solve_discounted, solve_finite
-from fusion_gym.solvers.source import SourceProblem
+from fusion_gym.solvers.single import (
+    lagrangian_bound,
+    solve_average,
+    solve_discounted,
+    solve_finite,
+)
+from fusion_gym.solvers.source import ErrorGrid, SourceProblem, TokenLevels, gaussian_rows
 from fusion_gym.solvers.task import solve_task, source_problems
-from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

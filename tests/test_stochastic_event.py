@@ -15,7 +15,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.stochastic_event import StochasticEvent
+from fusion_gym.policies.rules.measurements import StochasticEvent
 from fusion_gym.systems.tobit.filters import KalmanFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 

@@ -12,9 +12,9 @@ import pytest
 
 import fusion_gym
 from fusion_gym.commands import watch as command
+from fusion_gym.commands.watch import save_film
 from fusion_gym.envs.drawing import Film
 from fusion_gym.evaluation.watching import watch
-from fusion_gym.output.films import save_film
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 

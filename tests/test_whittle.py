@@ -7,8 +7,8 @@ import pytest
 
 import fusion_gym
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.optimal import WhittleIndex
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.whittle import WhittleIndex
 from fusion_gym.solvers.single import solve_average
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError

@@ -24,8 +24,6 @@ from agents.benchmark.evidence import (
     evaluate_policy,
     gather,
     point_rows,
-    processor_seconds,
-    search_again,
 )
 from agents.benchmark.jobs import Runner
 from agents.benchmark.report import print_classes, write_results
@@ -34,8 +32,8 @@ from agents.workers import BackendName, Pool
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.options import OUTPUT_FOLDER, whole, writable_folder
 from fusion_gym.output.ending import ended_like_by_ctrl_c
-from fusion_gym.output.folders import lock_folder
-from fusion_gym.output.progress import remark, writing
+from fusion_gym.output.files import lock_folder
+from fusion_gym.output.progress import writing
 from fusion_gym.validation import refusal
 
 
@@ -53,8 +51,6 @@ class Benchmark(Long):
     """Only compare this policy with the searched rule."""
     class_name: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
     """Class of the policy."""
-    second_search: bool = False
-    """Only search three classes again, with four times the generations, and compare."""
     results: Annotated[Path | None, OUTPUT_FOLDER] = None
     """Folder for tables, figures and README.md: results, or runs/benchmark/results with --quick."""
     work: Annotated[Path, OUTPUT_FOLDER] = Path("runs/benchmark")
@@ -68,8 +64,6 @@ class Benchmark(Long):
 
     def run(self) -> None:
         """Run unfinished work, and write the results."""
-        if self.second_search and self.policy is not None:
-            raise refusal("second_search", True, "given without --policy")
         if (self.policy is None) != (self.class_name is None):
             raise refusal("class", self.class_name, "given if and only if --policy is given")
         suite = load_suite(self.quick, self.settings)
@@ -82,15 +76,10 @@ class Benchmark(Long):
         with ended_like_by_ctrl_c(), lock_folder(work, "work"):
             runner = Runner(work.absolute(), pool)
             writing(("finished pieces of work", work))
-            if self.second_search or self.policy is not None:
-                if self.policy is not None and self.class_name is not None:
-                    classes = evaluate_policy(suite, runner, self.policy, self.class_name)
-                else:
-                    classes = search_again(suite, runner)
+            if self.policy is not None and self.class_name is not None:
+                classes = evaluate_policy(suite, runner, self.policy, self.class_name)
                 print_classes(class_rows(classes), point_rows(suite, classes))
                 return
-            minutes = processor_seconds(suite) / 60.0 / self.workers
-            remark(f"about {minutes:.0f} minutes with workers={self.workers}, less what is done")
             classes = gather(suite, runner)
             write_results(suite, classes, folder)
             print_classes(class_rows(classes), point_rows(suite, classes))

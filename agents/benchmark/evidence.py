@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.benchmark.bounds import BoundJob, run_bound
 from agents.benchmark.jobs import Runner
 from agents.benchmark.rules import SearchJob, SweepJob, SweepResult, rules_of, run_search, run_sweep
 from agents.benchmark.settings import (
@@ -29,17 +28,18 @@ from agents.benchmark.tables import (
     TestRow,
     TrainingRow,
 )
-from agents.benchmark.training import CALIBRATION, TrainingJob, TrainingResult, run_training
+from agents.benchmark.training import TrainingJob, TrainingResult, run_training
 from agents.benchmark.verdict import (
+    BoundJob,
     Difference,
     TestJob,
     TestResult,
     cost_difference,
     discoveries,
     mean_difference,
+    run_bound,
     run_test,
 )
-from fusion_gym import seeds
 from fusion_gym.core.knowledge import covers
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -115,18 +115,6 @@ def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     test_all(suite, runner, places)
     test_cases(suite, runner, [item for item in classes if item.name == "scheduler"])
     return classes
-
-
-def processor_seconds(suite: Suite) -> float:
-    """Return about the seconds of all work on one core."""
-    total = 0.0
-    for setting in suite.settings:
-        for name in CLASSES:
-            trainings = suite.seeds(setting, name) * len(suite.algorithms(setting, name))
-            total += SweepJob.weight + suite.generations / 30 * SearchJob.weight
-            total += trainings * suite.steps * setting.seconds[name] * (1.0 + CALIBRATION)
-            total += (3 + 2 * trainings) * suite.episodes / 1000 * TestJob.weight
-    return total
 
 
 def find_prices(
@@ -234,37 +222,13 @@ def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) ->
     """Test a policy in a class of every setting, together with the searched rule."""
     classes = find_prices(suite, runner, (name,))
     find_rules(suite, runner, classes)
-    test_pairs(suite, runner, classes, "policy", [text] * len(classes))
-    return classes
-
-
-def search_again(suite: Suite, runner: Runner) -> list[Evidence]:
-    """Search three random classes with four times the generations and other episodes."""
-    classes = find_prices(suite, runner)
-    find_rules(suite, runner, classes)
-    drawn = np.random.default_rng(0).choice(len(classes), min(3, len(classes)), replace=False)
-    classes = [classes[place] for place in sorted(drawn)]
-    generations, folder = 4 * suite.generations, runner.folder / "searches"
-    again = seeds.TRAINING[seeds.SECOND]
-    jobs = [
-        SearchJob(item.setting, item.name, item.prices, generations, folder, again)
-        for item in classes
-    ]
-    texts = [f"{text},price={{price}}" for text in runner.run(run_search, jobs, "second searches")]
-    test_pairs(suite, runner, classes, "second", texts)
-    return classes
-
-
-def test_pairs(
-    suite: Suite, runner: Runner, classes: Sequence[Evidence], kind: str, texts: Sequence[str]
-) -> None:
-    """Test the searched rule and another policy for each class, at all prices."""
     places = [
-        (item, name, [policy] * len(item.prices))
-        for item, text in zip(classes, texts, strict=True)
-        for name, policy in ((REFERENCE, item.priced_rule), (kind, text))
+        (item, kind, [policy] * len(item.prices))
+        for item in classes
+        for kind, policy in ((REFERENCE, item.priced_rule), ("policy", text))
     ]
     test_all(suite, runner, places)
+    return classes
 
 
 def policy_rows(suite: Suite, classes: Sequence[Evidence]) -> list[TestRow]:

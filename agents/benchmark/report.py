@@ -77,7 +77,7 @@ class Results(NamedTuple):
 
     policies: list[TestRow]
     points: list[PointRow]
-    means: list[ClassRow]
+    classes: list[ClassRow]
     savings: list[SavingRow]
     trainings: list[TrainingRow]
     cases: list[CaseRow]
@@ -94,8 +94,8 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
         training_rows(classes),
         case_rows([item for item in classes if item.name == "scheduler"]),
     )
-    for rows in results:
-        write_rows(folder, rows)
+    for name, rows in results._asdict().items():
+        write_rows(folder / f"{name}.csv", rows)
     titles = {setting.name: setting.title for setting in suite.settings}
     for name, title in titles.items():
         draw_setting([row for row in results.policies if row.setting == name], title, folder)
@@ -188,10 +188,10 @@ def headline_text(settings: Sequence[Setting], rows: Sequence[SavingRow]) -> str
 
 def class_table(titles: dict[str, str], results: Results) -> str:
     """Return the table of every kind of policy relative to the searched rule."""
-    by_kind = {(row.setting, row.name, row.kind): row for row in results.means}
+    by_kind = {(row.setting, row.name, row.kind): row for row in results.classes}
     trainings, shares = grouped(results.trainings), len({row.share for row in results.policies})
     lines = []
-    for place in dict.fromkeys((row.setting, row.name) for row in results.means):
+    for place in dict.fromkeys((row.setting, row.name) for row in results.classes):
         cells = [
             mean_text(by_kind.get((*place, kind)))
             for kind in ("learned", "agent", "threshold", "trigger")
@@ -220,7 +220,7 @@ def mean_text(row: ClassRow | None) -> str:
 
 def comparison_table(titles: dict[str, str], results: Results) -> str:
     """Return the table of both algorithms in the classes where there are two."""
-    by_kind = {(row.setting, row.name, row.kind): row for row in results.means}
+    by_kind = {(row.setting, row.name, row.kind): row for row in results.classes}
     trainings = grouped(results.trainings)
     lines = [
         (
@@ -244,7 +244,7 @@ def grouped(rows: Sequence[TrainingRow]) -> dict[tuple[str, str, str], list[Trai
 
 def sentences(results: Results) -> list[str]:
     """Return the sentences on the gains of learned policies."""
-    rows = {kind: [r for r in results.means if r.kind == kind] for kind in ("learned", "agent")}
+    rows = {kind: [r for r in results.classes if r.kind == kind] for kind in ("learned", "agent")}
 
     def mean(kind: str) -> str:
         values = [row.difference for row in rows[kind]]

@@ -86,7 +86,6 @@ class SearchJob(Job):
     prices: tuple[float, ...]
     generations: int
     folder: Path = field(metadata={"key": False})
-    seed: int = seeds.TRAINING.start
     weight: ClassVar[float] = 110.0
 
 
@@ -158,8 +157,8 @@ def _finer(
 def run_search(job: SearchJob) -> str:
     """Return the searched rule as text; the folder holds unfinished generations."""
     task = job.setting.task(job.name)
-    search = search_of_class(job.name, task, job.prices, generations=job.generations, seed=job.seed)
-    state = job.folder / f"{job.setting.name}_{job.name}_{job.seed}.json"
+    search = search_of_class(job.name, task, job.prices, generations=job.generations)
+    state = job.folder / f"{job.setting.name}_{job.name}.json"
     state.parent.mkdir(parents=True, exist_ok=True)
     content = json.loads(state.read_text()) if state.exists() else []
     earlier = [Generation(**item) for item in content]

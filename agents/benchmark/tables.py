@@ -1,17 +1,17 @@
-"""The benchmark's tables: one frozen dataclass for each kind of row, as CSV."""
+"""The benchmark's tables: one named tuple for each kind of row, as CSV."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
 
 from fusion_gym.output.files import replacing
 
 
-@dataclass(frozen=True)
-class TestRow:
+class TestRow(NamedTuple):
     """A policy at a price on the test episodes: means per step."""
 
     setting: str
@@ -28,8 +28,7 @@ class TestRow:
     policy: str
 
 
-@dataclass(frozen=True)
-class PointRow:
+class PointRow(NamedTuple):
     """The cost of a kind of policy at a price, relative to the searched rule's, minus 1."""
 
     setting: str
@@ -43,8 +42,7 @@ class PointRow:
     discovery: bool  # after Benjamini and Hochberg, over all points of the table
 
 
-@dataclass(frozen=True)
-class ClassRow:
+class ClassRow(NamedTuple):
     """The mean of these differences over a class's prices and seeds; the median over seeds."""
 
     setting: str
@@ -56,8 +54,7 @@ class ClassRow:
     median: float
 
 
-@dataclass(frozen=True)
-class SavingRow:
+class SavingRow(NamedTuple):
     """The share of the own trigger's cost that a kind saves: a mean over prices and classes."""
 
     setting: str
@@ -68,8 +65,7 @@ class SavingRow:
     high: float
 
 
-@dataclass(frozen=True)
-class TrainingRow:
+class TrainingRow(NamedTuple):
     """A training and its calibration: processor seconds, and costs over the rule's, minus 1."""
 
     setting: str
@@ -85,8 +81,7 @@ class TrainingRow:
     learned: float
 
 
-@dataclass(frozen=True)
-class CaseRow:
+class CaseRow(NamedTuple):
     """A perturbed case: the rule's cost over its nominal cost, the learned policy's over that."""
 
     setting: str
@@ -97,22 +92,8 @@ class CaseRow:
     high: float
 
 
-KINDS: dict[type, str] = {
-    TestRow: "policies",
-    PointRow: "points",
-    ClassRow: "classes",
-    SavingRow: "savings",
-    TrainingRow: "trainings",
-    CaseRow: "cases",
-}
-
-
-def write_rows(folder: Path, rows: Sequence[object]) -> None:
-    """Write rows of one kind as a CSV file into the folder."""
-    kind = type(rows[0])
-    with replacing(folder / f"{KINDS[kind]}.csv") as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [item.name for item in fields(kind)], lineterminator="\n")  # type: ignore[arg-type]
-        writer.writeheader()
-        for row in rows:
-            values = asdict(row).items()  # type: ignore[call-overload]
-            writer.writerow({key: f"{v:.6g}" if isinstance(v, float) else v for key, v in values})
+def write_rows(path: Path, rows: Sequence[object]) -> None:
+    """Write rows of one kind as a CSV file."""
+    with replacing(path) as partial:
+        table = pd.DataFrame(rows)
+        table.to_csv(partial, index=False, float_format="%.6g", na_rep="nan", lineterminator="\n")

@@ -1,4 +1,4 @@
-"""Tests of policies, and their cost relative to the searched rule at equal price."""
+"""Tests of policies, bounds of their cost, and their cost relative to the searched rule's."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.solvers.silence import cost_bound
+from fusion_gym.validation import ConfigurationError
 
 LEVEL = 0.95
 FALSE_DISCOVERIES = 0.05
@@ -136,3 +138,20 @@ def discoveries(p_values: Sequence[float]) -> list[bool]:
         return []
     adjusted = stats.false_discovery_control(np.clip(p_values, 0.0, 1.0))
     return [bool(value <= FALSE_DISCOVERIES) for value in adjusted]
+
+
+@dataclass(frozen=True)
+class BoundJob(Job):
+    """The proven lower bound of the cost at each price of a class."""
+
+    prices: tuple[float, ...]
+    weight: ClassVar[float] = 10.0
+
+
+def run_bound(job: BoundJob) -> tuple[float, ...]:
+    """Return the bound at each price, or an empty tuple where it does not apply."""
+    task = job.setting.task(job.name)
+    try:
+        return tuple(cost_bound(task, price).lower for price in job.prices)
+    except ConfigurationError:
+        return ()

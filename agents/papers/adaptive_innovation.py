@@ -37,7 +37,7 @@ from agents.papers.paper import (
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.output import palette
-from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
+from fusion_gym.policies.rules.measurements import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 
 STATES = ("position", "velocity", "acceleration")

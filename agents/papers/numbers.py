@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.evaluation.metrics import Interval, mean_interval
 
 Verdict = Literal["holds", "holds partly", "does not hold"]
 

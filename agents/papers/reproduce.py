@@ -40,7 +40,7 @@ from fusion_gym.commands.options import OUTPUT_FOLDER, Seed, whole
 from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.output.ending import ended_like_by_ctrl_c
-from fusion_gym.output.folders import lock_folder
+from fusion_gym.output.files import lock_folder
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import integer
 

@@ -31,7 +31,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options, Plain
 from fusion_gym.evaluation.episodes import record_episode
-from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.evaluation.metrics import Interval, mean_interval
 from fusion_gym.output import palette
 from fusion_gym.policies.registry import make_policy
 

@@ -42,9 +42,8 @@ from fusion_gym.output.files import write
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy, policy_names, policy_parameters
 from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, Sweep, SweepCurve
 from fusion_gym.training.diagnosis import warn_of_unused_tokens
-from fusion_gym.training.sweeps import Sweep, SweepCurve
 from fusion_gym.validation import refusal
 
 

@@ -22,8 +22,14 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments, Plain
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.intervals import Interval, mean_interval
-from fusion_gym.evaluation.metrics import METRICS, paired_difference, robust_summary, summarise
+from fusion_gym.evaluation.metrics import (
+    METRICS,
+    Interval,
+    mean_interval,
+    paired_difference,
+    robust_summary,
+    summarise,
+)
 from fusion_gym.output import tables
 from fusion_gym.output.files import read_json, write
 from fusion_gym.output.progress import progress_bar, remark, writing

@@ -36,10 +36,15 @@ from fusion_gym.evaluation.field_study import (
     point_at,
     simulate_sizes,
 )
-from fusion_gym.output.data_card import draw_card
-from fusion_gym.output.field_report import FieldReport, draw_curves, write_report
-from fusion_gym.output.files import read_json, write, write_text
-from fusion_gym.output.folders import check_inputs, folder_refusal, lock_folder
+from fusion_gym.output.field_report import FieldReport, draw_card, draw_curves, write_report
+from fusion_gym.output.files import (
+    check_inputs,
+    folder_refusal,
+    lock_folder,
+    read_json,
+    write,
+    write_text,
+)
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.recordings import Recording, fit
 from fusion_gym.recordings.fitting import criticise, deviations, noisy_channels, warnings_of

@@ -17,7 +17,7 @@ import yaml
 
 from fusion_gym.commands.command_line import Command
 from fusion_gym.commands.options import OutputFile, between
-from fusion_gym.output.data_card import RATIOS, criticism_rows
+from fusion_gym.output.field_report import RATIOS, criticism_rows
 from fusion_gym.output.files import write_text
 from fusion_gym.output.progress import remark, writing
 from fusion_gym.output.tables import console, table_tables

@@ -35,8 +35,7 @@ from fusion_gym.evaluation.rule_search import (
     search_rule,
 )
 from fusion_gym.output import tables
-from fusion_gym.output.files import read_json, write
-from fusion_gym.output.folders import check_inputs, folder_refusal, lock_folder
+from fusion_gym.output.files import check_inputs, folder_refusal, lock_folder, read_json, write
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.checked import checked

@@ -17,13 +17,15 @@ from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
 from fusion_gym.envs.drawing import Film, Frame
-from fusion_gym.envs.members import Members
 from fusion_gym.envs.registration import FusionSpec
 from fusion_gym.envs.views import SchedulerView
 
 Infos = Arguments
 RENDER_MODES = ("rgb_array", "human")
 FRAMES_PER_SECOND = 10
+# Attributes of a single environment that all runs share.
+_SHARED = ("task", "view", "observation_names", "reward_space", "spec", "metadata", "render_mode")
+_METHODS = ("action_masks", "render")
 
 
 class Specified:
@@ -44,7 +46,7 @@ class Specified:
             self._spec.max_episode_steps = self.task.horizon
 
 
-class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
+class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
     """Run N episodes of a task behind Gymnasium's vector interface.
 
     Episodes end at the task's horizon: by truncation, or with ``clock=True`` by termination.
@@ -226,6 +228,41 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         terminated, truncated = (ended, never) if self.task.clock else (never, ended)
         infos = _with_mask(infos, self._everyone) | final
         return batch.observe(), reward, terminated, truncated, infos
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return the choices (N, choices), bool, that the network can grant as a single request."""
+        return self.view.masks(self.batch.grantable())
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return the result of ``action_masks`` or ``render``, or an attribute, once per run."""
+        if name in _METHODS:
+            result = getattr(self, name)(*args, **kwargs)
+            return (None,) * self.num_envs if result is None else tuple(result)
+        return (self._attribute(name),) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute once per run, the spaces without the batch axis."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Raise an ``AttributeError``, because all runs share one task."""
+        raise AttributeError(
+            f"cannot set {name!r} of some runs: they share one task; make a new environment"
+        )
+
+    def _attribute(self, name: str) -> Any:
+        if name == "observation_space":
+            return self.single_observation_space
+        if name == "action_space":
+            return self.single_action_space
+        if name in _SHARED and hasattr(self, name):
+            return getattr(self, name)
+        known = [*_METHODS, "observation_space", "action_space"]
+        known += [shared for shared in _SHARED if hasattr(self, shared)]
+        raise AttributeError(
+            f"the runs share one batch and have no {validation.display(name)}: known are "
+            + ", ".join(known)
+        )
 
 
 def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MODES) -> str | None:

@@ -2,8 +2,13 @@
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
-from fusion_gym.evaluation.intervals import Interval, mean_interval
-from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
+from fusion_gym.evaluation.metrics import (
+    Interval,
+    mean_interval,
+    paired_difference,
+    robust_summary,
+    summarise,
+)
 from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from fusion_gym.core.scale import lower_hull
 from fusion_gym.evaluation.episodes import EpisodeResults
-from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.evaluation.metrics import Interval, mean_interval
 from fusion_gym.validation import ConfigurationError
 
 FAR_APART = 1.5

@@ -15,7 +15,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.intervals import LEVEL, RESAMPLES, Interval
+from fusion_gym.evaluation.metrics import LEVEL, RESAMPLES, Interval
 from fusion_gym.policies.registry import make_policy
 
 ENV = "fusion_gym/RecordedFusion-v1"

@@ -8,8 +8,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from fusion_gym.evaluation.intervals import Interval
-from fusion_gym.evaluation.metrics import METRICS, Metric
+from fusion_gym.evaluation.metrics import METRICS, Interval, Metric
 
 
 def console() -> Console:

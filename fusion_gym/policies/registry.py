@@ -51,34 +51,33 @@ class PolicyRow(NamedTuple):
 
 _SHIPPED: dict[Kind, dict[str, str]] = {
     "rule": {
-        "adaptive_innovation": "rules.adaptive_innovation:AdaptiveInnovation",
-        "adaptive_threshold": "rules.adaptive_threshold:AdaptiveThreshold",
-        "always": "rules.constant:Always",
-        "centre_variance": "rules.centre_variance:CentreVariance",
-        "dynamic_event": "rules.dynamic_event:DynamicEvent",
-        "information_gain": "rules.information_gain:InformationGain",
-        "innovation_threshold": "rules.innovation_threshold:InnovationThreshold",
-        "local_variance": "rules.local_variance:LocalVariance",
-        "never": "rules.constant:Never",
-        "paced": "rules.paced:Paced",
-        "periodic": "rules.periodic:Periodic",
-        "random": "rules.random:Random",
-        "report_on_change": "rules.report_on_change:ReportOnChange",
-        "round_robin": "rules.periodic:RoundRobin",
-        "send_on_delta": "rules.send_on_delta:SendOnDelta",
-        "stochastic_event": "rules.stochastic_event:StochasticEvent",
-        "variance_threshold": "rules.variance_threshold:VarianceThreshold",
+        "adaptive_innovation": "rules.measurements:AdaptiveInnovation",
+        "adaptive_threshold": "rules.measurements:AdaptiveThreshold",
+        "always": "rules.schedules:Always",
+        "centre_variance": "rules.schedules:CentreVariance",
+        "dynamic_event": "rules.measurements:DynamicEvent",
+        "information_gain": "rules.schedules:InformationGain",
+        "innovation_threshold": "rules.measurements:InnovationThreshold",
+        "local_variance": "rules.schedules:LocalVariance",
+        "never": "rules.schedules:Never",
+        "paced": "rules.schedules:Paced",
+        "periodic": "rules.schedules:Periodic",
+        "random": "rules.schedules:Random",
+        "report_on_change": "rules.measurements:ReportOnChange",
+        "round_robin": "rules.schedules:RoundRobin",
+        "send_on_delta": "rules.measurements:SendOnDelta",
+        "stochastic_event": "rules.measurements:StochasticEvent",
+        "variance_threshold": "rules.schedules:VarianceThreshold",
     },
     "reference": {
-        "estimate_difference": "rules.estimate_difference:EstimateDifference",
-        "kullback_leibler": "rules.kullback_leibler:KullbackLeibler",
-        "lookahead": "lookahead:Lookahead",
+        "estimate_difference": "rules.beliefs:EstimateDifference",
+        "kullback_leibler": "rules.beliefs:KullbackLeibler",
         "optimal": "optimal:OptimalPolicy",
         "periodic_optimum": "periodic_optimum:PeriodicOptimum",
         "priced_threshold": "rules.priced_threshold:PricedThreshold",
         "rollout": "rollout:Rollout",
-        "value_of_information": "rules.value_of_information:ValueOfInformation",
-        "whittle": "whittle:WhittleIndex",
+        "value_of_information": "rules.beliefs:ValueOfInformation",
+        "whittle": "optimal:WhittleIndex",
     },
     "agent": {
         "model": "saved:saved_agent",
@@ -108,7 +107,7 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
 
     Example:
         >>> from fusion_gym import policy_names, register_policy
-        >>> from fusion_gym.policies.rules.periodic import Periodic
+        >>> from fusion_gym.policies.rules.schedules import Periodic
         >>> register_policy("clocked", Periodic)
         >>> "clocked" in policy_names("rule")
         True

@@ -1,8 +1,6 @@
 """The optimal cost of remote estimation by dynamic programming, and bounds on it."""
 
 from fusion_gym.solvers.ages import AgeSolution, solve_ages
-from fusion_gym.solvers.bounds import DualBound, lagrangian_bound
-from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.joint import (
     JointAverageSolution,
     JointFiniteSolution,
@@ -13,14 +11,15 @@ from fusion_gym.solvers.joint import (
 from fusion_gym.solvers.single import (
     AverageSolution,
     DiscountedSolution,
+    DualBound,
     FiniteSolution,
+    lagrangian_bound,
     solve_average,
     solve_discounted,
     solve_finite,
 )
-from fusion_gym.solvers.source import SourceProblem
+from fusion_gym.solvers.source import ErrorGrid, SourceProblem, TokenLevels
 from fusion_gym.solvers.task import Optimum, solve_task, source_problems
-from fusion_gym.solvers.tokens import TokenLevels
 
 __all__ = [
     "AgeSolution",

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import forbidden
-from fusion_gym.solvers.iteration import iterate_values
+from fusion_gym.solvers.single import iterate_values
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 

@@ -11,10 +11,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.errors import forbidden
-from fusion_gym.solvers.grid import ErrorGrid
-from fusion_gym.solvers.iteration import iterate_values
-from fusion_gym.solvers.source import Resolution, SourceProblem
-from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.solvers.single import iterate_values
+from fusion_gym.solvers.source import ErrorGrid, Resolution, SourceProblem, TokenLevels
 
 _RESOLUTION = Resolution(finest=20.0, coarsest=4.0, points=160, negligible=1e-5)
 _RESOLUTION_TOKENS = _RESOLUTION._replace(points=110)  # where tokens are limited

@@ -1,4 +1,4 @@
-"""One source of remote estimation as a problem of dynamic programming."""
+"""One source of remote estimation as a problem of dynamic programming, on a grid of errors."""
 
 from __future__ import annotations
 
@@ -6,14 +6,130 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
-from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
-from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.validation import ConfigurationError
+
+_MOST_POINTS = 1500
+
+
+@dataclass(frozen=True)
+class ErrorGrid:
+    """Absolute errors 0, h, 2h, … and the matrix of E[V(a e + w)] for even functions V.
+
+    The Gaussian density is sampled at the grid's points. By Poisson's summation formula a row then
+    has the sum 1 and the mean and variance of the Gaussian, up to 2 exp(-2π² σ²/h²). The remaining
+    error is due to the kinks of V, of order h². The last point has the probability beyond it, so
+    ``kernel`` is a stochastic matrix.
+
+    Shapes: ``points`` (M,), ``kernel`` (M, M) from the error after a delivery (row) to the next.
+    """
+
+    points: Array
+    kernel: Array
+
+    @classmethod
+    def create(cls, coefficient: float, deviation: float, reach: float, step: float) -> ErrorGrid:
+        """Return errors up to ``reach`` in steps of ``step``, from 3 to 1,500 points."""
+        count = min(max(int(np.ceil(reach / step)) + 1, 3), _MOST_POINTS)
+        points: Array = np.arange(count, dtype=np.float64) * float(step)
+        return cls(points, gaussian_rows(coefficient * points, deviation, points))
+
+
+def gaussian_rows(mean: Array, deviation: float, points: Array) -> Array:
+    """Return the weights (R, M) of the points of |X|, X ~ N(mean, deviation²); rows sum to 1."""
+    step = points[1]
+    scale = step / (deviation * np.sqrt(2.0 * np.pi))
+    rows = np.exp(-0.5 * ((points - mean[:, None]) / deviation) ** 2)
+    rows[:, 1:] += np.exp(-0.5 * ((points[1:] + mean[:, None]) / deviation) ** 2)
+    rows *= scale
+    rows[:, -1] += np.maximum(1.0 - rows.sum(1), 0.0)
+    return rows / rows.sum(1, keepdims=True)
+
+
+_MOST_LEVELS = 500
+_MOST_SENSORS = 12
+_DIGITS = 9
+
+
+@dataclass(frozen=True)
+class TokenLevels:
+    """The reachable levels of a token bucket, and the effect of each set of requests.
+
+    A choice is a set of sensors, the bits of its number; choice 0 is silence.
+
+    Args:
+        level: levels (K,) in ascending order.
+        initial: index of the level at the start.
+        affordable: whether the network grants every request of the choice (K, choices), bool.
+        following: index of the next level (K, choices).
+        spent: tokens of each choice (choices,).
+    """
+
+    level: Array
+    initial: int
+    affordable: NDArray[np.bool_]
+    following: NDArray[np.int64]
+    spent: Array
+
+    @classmethod
+    def create(cls, bucket: TokenBucket) -> TokenLevels:
+        """Return the reachable levels of the bucket; an unlimited bucket has one level."""
+        sensors = len(bucket.cost)
+        if sensors > _MOST_SENSORS:
+            raise ConfigurationError(
+                f"sensors = {sensors} is not allowed for the exact optimum under a common bucket: "
+                f"it must be at most {_MOST_SENSORS}, because all 2^{sensors} sets of sensors are "
+                "choices"
+            )
+        choices = np.arange(2**sensors)
+        sets = (choices >> np.arange(sensors)[:, None] & 1).astype(np.bool_)
+        spent = (sets * bucket.cost).sum(0)
+        start = float(bucket.start(1)[0])
+        if bucket.unlimited:
+            everything = np.ones((1, len(choices)), dtype=np.bool_)
+            return cls(np.array([start]), 0, everything, np.zeros((1, len(choices)), int), spent)
+        result, new = {round(start, _DIGITS)}, [round(start, _DIGITS)]
+        while new:
+            following = {
+                round(float(level), _DIGITS)
+                for source in new
+                for level in bucket.grant(np.full(len(choices), source), sets).tokens
+            }
+            new = sorted(following - result)
+            result |= following
+            if len(result) > _MOST_LEVELS:
+                raise ConfigurationError(
+                    f"token_rate = {bucket.rate}, token_capacity = {bucket.capacity} are not "
+                    f"allowed for the exact optimum: the bucket must have at most {_MOST_LEVELS} "
+                    "levels, so rate, cost and capacity need a common divisor"
+                )
+        level = np.array(sorted(result))
+        grants = bucket.grant(np.repeat(level, len(choices)), np.tile(sets, len(level)))
+        shape = (len(level), len(choices))
+        affordable = (grants.granted == np.tile(sets, len(level))).all(0).reshape(shape)
+        after = np.searchsorted(level, np.round(grants.tokens, _DIGITS) - 10.0**-_DIGITS)
+        initial = int(np.searchsorted(level, round(start, _DIGITS) - 10.0**-_DIGITS))
+        return cls(level, initial, affordable, after.reshape(shape), spent)
+
+    @property
+    def wait(self) -> float:
+        """Steps for which the tokens of all sensors are saved; 0 for unlimited tokens."""
+        if len(self.level) == 1:
+            return 0.0
+        rate = float((self.level[self.following[:, 0]] - self.level).max())
+        return float(self.spent[-1]) / max(rate, 1e-12)
+
+    def index(self, tokens: Array) -> NDArray[np.int64]:
+        """Return the index of each level in ``tokens`` (N,)."""
+        if len(self.level) == 1:
+            return np.zeros(len(tokens), dtype=np.int64)
+        middle = 0.5 * (self.level[1:] + self.level[:-1])
+        return np.searchsorted(middle, tokens)
 
 
 class Resolution(NamedTuple):

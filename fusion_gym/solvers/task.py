@@ -10,11 +10,9 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import Channel
 from fusion_gym.core.task import Task
-from fusion_gym.solvers.grid import ErrorGrid
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import AverageSolution, FiniteSolution, solve_average, solve_finite
-from fusion_gym.solvers.source import SourceProblem
-from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.solvers.source import ErrorGrid, SourceProblem, TokenLevels
 from fusion_gym.systems.remote.system import ScalarSources
 from fusion_gym.validation import ConfigurationError
 
@@ -95,7 +93,7 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
 
     Raises:
         ConfigurationError: a task without a solver, for example three sources that share tokens
-            (:func:`fusion_gym.solvers.bounds.lagrangian_bound` bounds its cost from below).
+            (:func:`fusion_gym.solvers.single.lagrangian_bound` bounds its cost from below).
     """
     validation.choice("criterion", criterion, CRITERIA)
     problems, bucket = source_problems(task), task.network.bucket

@@ -15,8 +15,7 @@ import numpy as np
 from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import run_priced
-from fusion_gym.evaluation.policy_batch import seeded
+from fusion_gym.evaluation.episodes import run_priced, seeded
 from fusion_gym.evaluation.rule_search import class_of, search_of_class
 from fusion_gym.output.files import replacing
 from fusion_gym.output.progress import progress_bar

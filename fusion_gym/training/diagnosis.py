@@ -9,17 +9,32 @@ from typing import NamedTuple
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.scale import sustained_tokens
 from fusion_gym.core.task import Task
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_priced
 from fusion_gym.evaluation.rule_search import class_of, search_of_class
 from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy
-from fusion_gym.training.callback import Callback
 
 PRICES = 5  # of a validation over a range, evenly spaced on a logarithmic scale
+
+
+class Callback(BaseCallback):
+    """A callback between rollouts, with access to the training's environment."""
+
+    @property
+    def environment(self) -> FusionSB3VecEnv:
+        """The environment without wrappers."""
+        env = self.training_env.unwrapped
+        assert isinstance(env, FusionSB3VecEnv)
+        return env
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class Traffic(Callback):

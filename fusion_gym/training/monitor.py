@@ -18,10 +18,10 @@ from fusion_gym.core.task import Task
 from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.progress import Bar
 from fusion_gym.training import checkpoint
-from fusion_gym.training.callback import Callback
 from fusion_gym.training.checkpoint import Journal, ValidationRecord
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.diagnosis import (
+    Callback,
     PriceRecord,
     run_at_prices,
     threshold_costs,
