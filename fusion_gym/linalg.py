@@ -164,13 +164,8 @@ def outer(u: FloatArray, v: FloatArray) -> FloatArray:
 
 def dot(u: FloatArray, v: FloatArray) -> FloatArray:
     """Return the inner product ``u^T v``, ``(..., N)``, of two vectors ``(..., n, N)``."""
-    length = u.shape[-2]
-    _require_equal_lengths("dot", length, v.shape[-2])
-    product = u * v
-    result: FloatArray = product[..., 0, :]
-    for k in range(1, length):
-        result = result + product[..., k, :]
-    return result
+    _require_equal_lengths("dot", u.shape[-2], v.shape[-2])
+    return total(u * v)
 
 
 def quadratic(v: FloatArray, a: FloatArray) -> FloatArray:

@@ -70,7 +70,7 @@ ADDITIONS = {
         (
             (
                 "policies/registry.py",
-                '        "never": "rules.constant:Never",',
+                '        "never": "rules.schedules:Never",',
                 '        "old_news": "rules.old_news:OldNews",',
             ),
         ),

@@ -3,7 +3,7 @@
 import copy
 import multiprocessing
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -33,7 +33,14 @@ RULES = (
 )
 
 
-@pytest.mark.parametrize(("name", "options"), dict(TASKS).items())
+def slowly(tasks: Iterable[tuple[str, dict[str, Any]]]) -> list[Any]:
+    return [pytest.param(*task, marks=pytest.mark.slow) for task in tasks]
+
+
+FIRST = list(dict(TASKS).items())  # one of each environment; the last three compile long
+
+
+@pytest.mark.parametrize(("name", "options"), [*FIRST[:-3], *slowly(FIRST[-3:])])
 def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(f"fusion_gym/{name}", **options | {"horizon": HORIZON})
     env, parts = FunctionalEnv(task), (task.plant, task.network)
@@ -68,10 +75,7 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
         assert bool(result.ended[0])
 
 
-SLOWLY = [pytest.param(*task, marks=pytest.mark.slow) for task in SLOW_TASKS]
-
-
-@pytest.mark.parametrize(("name", "options"), [*TASKS, *SLOWLY])
+@pytest.mark.parametrize(("name", "options"), [*TASKS, *slowly(SLOW_TASKS)])
 def test_backend_equals_numpy_and_itself_in_any_batch(name: str, options: dict[str, Any]) -> None:
     options = {"horizon": HORIZON, "vectorization_mode": "vector_entry_point"} | options
     envs = [

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
-from fusion_gym.systems.correlated.sensors import CorrelatedSensors
+from fusion_gym.systems.correlated.filters import (
+    CorrelatedSensors,
+    JointErrorCovariance,
+    RobustKalmanFilter,
+)
 from fusion_gym.systems.linear_plant import LinearPlant
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.intersection import covariance_intersection, inverse_covariance_intersection
 from fusion_gym.fusion.table import RULES
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.systems.unknown_input.fusion import tracked_intersection
+from fusion_gym.systems.unknown_input.nodes import tracked_intersection
 
 Array = NDArray[np.float64]
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"

@@ -18,12 +18,14 @@ from fusion_gym import linalg
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.fusion.several import CovarianceIntersection, covariance_intersection_many
 from fusion_gym.policies.rules.measurements import AdaptiveThreshold
-from fusion_gym.systems.unknown_input.bound_filter import BoundTables
-from fusion_gym.systems.unknown_input.filters import RandomWalkInputFilter
-from fusion_gym.systems.unknown_input.fusion import NodeFusion, tracked_intersection
-from fusion_gym.systems.unknown_input.input_state import InputModel, JointGain
-from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
-from fusion_gym.systems.unknown_input.sensors import InputSensors
+from fusion_gym.systems.unknown_input.filters import (
+    BoundTables,
+    InputModel,
+    JointGain,
+    RandomWalkInputFilter,
+)
+from fusion_gym.systems.unknown_input.nodes import NodeFusion, tracked_intersection
+from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

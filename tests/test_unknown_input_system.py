@@ -12,7 +12,7 @@ from scipy.special import ndtr
 
 from fusion_gym.envs.registration import make_task
 from fusion_gym.fusion.several import covariance_intersection_many
-from fusion_gym.systems.unknown_input.examples import EXAMPLES, two_carts
+from fusion_gym.systems.unknown_input.environment import EXAMPLES, two_carts
 
 build = partial(make_task, "fusion_gym/UnknownInput-v1")
 

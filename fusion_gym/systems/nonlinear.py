@@ -232,10 +232,8 @@ class NonlinearEstimator(AdoptingEstimator[FilteredEstimate]):
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
         nodes, names = numbered(self.system.sensors), self.system.state_names
-        labels, (magnitude, reference) = (
-            (nodes, numbered(self.system.channels)),
-            self.system.typical,
-        )
+        magnitude, reference = self.system.typical
+        labels = nodes, numbered(self.system.channels)
         new = partial(Block, labels=labels, knowledge="own", node="own", limit=RANGE)
         return (
             new(
@@ -280,13 +278,7 @@ class NonlinearEstimator(AdoptingEstimator[FilteredEstimate]):
             first, other = self.system.update(mean, covariance, sensor, state.measurement[sensor])
             mean = np.where(arrived[sensor], first, mean)
             covariance = np.where(arrived[sensor], linalg.symmetrise(other), covariance)
-        return replace(
-            state,
-            held=np.where(arrived[:, None], state.measurement, state.held),
-            age=np.where(arrived, 0.0, state.age),
-            mean=mean,
-            covariance=covariance,
-        )
+        return state.after(arrived, mean=mean, covariance=covariance)
 
     def read(self, state: FilteredEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals."""
@@ -305,15 +297,13 @@ class NonlinearEstimator(AdoptingEstimator[FilteredEstimate]):
 
     def _deviation(self, state: FilteredEstimate) -> Array:
         """Return the innovation's deviation, by secants over one deviation of each source."""
-        mean = state.prior_mean
+        mean, measured = state.prior_mean, self.system.measured
         nothing = np.zeros((self.system.sensors * self.system.channels, mean.shape[-1]))
-        variance = (
-            self.system.measured(mean, nothing + 1.0) - self.system.measured(mean, nothing)
-        ) ** 2
+        variance = (measured(mean, nothing + 1.0) - measured(mean, nothing)) ** 2
         root = linalg.root(state.prior_covariance)
         for column in range(root.shape[1]):
-            ahead = self.system.measured(mean + root[:, column], nothing)
-            behind = self.system.measured(mean - root[:, column], nothing)
+            ahead = measured(mean + root[:, column], nothing)
+            behind = measured(mean - root[:, column], nothing)
             variance = variance + (0.5 * (ahead - behind)) ** 2
         return np.sqrt(variance) + 1e-12
 

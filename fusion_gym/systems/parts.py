@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import linalg
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, StateT
 from fusion_gym.core.knowledge import Block
 from fusion_gym.core.plant import Plant
+from fusion_gym.namespace import namespace
 
 RANGE = 5.0  # whitened quantities and logarithms of ratios are clipped here
 
@@ -57,6 +58,12 @@ class Deliveries:
     held: Array
     age: Array
 
+    def after(self, arrived: NDArray[np.bool_], **changes: Any) -> Self:
+        """Return the state after packets (l, N) of measurements, with changes of other fields."""
+        xp = namespace(arrived, self.measurement)
+        held = xp.where(arrived[:, None], self.measurement, self.held)
+        return replace(self, held=held, age=xp.where(arrived, 0.0, self.age), **changes)
+
 
 class SensorPlant(Plant[StateT]):
     """A plant of dynamics and sensors, each with its own normals."""
@@ -76,6 +83,11 @@ class SensorPlant(Plant[StateT]):
         """Normals of one step: process noise, then the sensors'."""
         channels: int = self.dynamics.noise_channels + self.sensors.noise_channels
         return channels
+
+    def open_loop(self, horizon: int) -> Array:
+        """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
+        variances: Array = self.dynamics.open_loop(horizon)
+        return variances
 
 
 class AdoptingEstimator(Estimator[StateT]):
@@ -167,6 +179,21 @@ def variance_block(
         limit=RANGE,
         constants={"open-loop mean": reference},
     )
+
+
+def trigger_parameters(
+    options: Any, names: tuple[str, ...], sensors: int, usual: Mapping[str, ArrayLike] | None = None
+) -> dict[str, tuple[float, ...]]:
+    """Return a policy's parameters from ``trigger_*``, numbers >= 0, one for each sensor.
+
+    ``usual`` has the values of parameters that are ``None``, for any number of sensors.
+    """
+    result = {}
+    for name in names:
+        value = getattr(options, field := f"trigger_{name}")
+        value = np.resize((usual or {})[name], sensors) if value is None else value
+        result[name] = tuple(validation.not_negative(field, value, (sensors,)).tolist())
+    return result
 
 
 def numbered_states(size: int, usual: tuple[str, ...] = ()) -> tuple[str, ...]:

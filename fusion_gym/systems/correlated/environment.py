@@ -19,15 +19,18 @@ from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
-from fusion_gym.systems.correlated.sensors import CorrelatedSensors
+from fusion_gym.systems.correlated.filters import (
+    CorrelatedSensors,
+    JointErrorCovariance,
+    RobustKalmanFilter,
+)
 from fusion_gym.systems.correlated.system import (
     RANDOM_SCALE,
     CorrelatedTrackingEstimator,
     CorrelatedTrackingPlant,
 )
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.parts import numbered_states, trigger_parameters
 
 _T = 0.01  # the paper's sampling time
 _STRUCTURE = Structure(common="all contain the same process noise", prediction=True)
@@ -133,7 +136,7 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
         noise_scale=float(np.mean(RANDOM_SCALE)) if scale is None else scale,
         joint=JointErrorCovariance.create(plant, sensors) if options.track_actual else None,
     )
-    trigger = _trigger(options, sensors.count)
+    trigger = trigger_parameters(options, ("threshold", "offset", "sensitivity"), sensors.count)
     return Scenario(options, truth, estimator, weights, {"adaptive_innovation": trigger})
 
 
@@ -162,13 +165,3 @@ def _noise_scale(value: float | str) -> float | None:
             return None
         raise validation.refusal("noise_scale", value, "a number > 0 and <= 1, or 'random'")
     return validation.number("noise_scale", value, above=0.0, at_most=1.0)
-
-
-def _trigger(options: CorrelatedTrackingOptions, sensors: int) -> dict[str, tuple[float, ...]]:
-    """Parameters of the adaptive innovation trigger, one number a sensor."""
-    result = {}
-    for name in ("threshold", "offset", "sensitivity"):
-        field = f"trigger_{name}"
-        values = validation.not_negative(field, getattr(options, field), (sensors,))
-        result[name] = tuple(values.tolist())
-    return result

@@ -28,11 +28,11 @@ from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.namespace import namespace, ndtr, set_at, update_at
 from fusion_gym.systems.correlated.filters import (
+    CorrelatedSensors,
     JointErrorCovariance,
     RobustKalmanFilter,
     RobustOutcomes,
 )
-from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.validation import refusal
@@ -98,10 +98,6 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
         scale = self._scale(noise[-1])
         truth = linalg.draw_normal(mean, scale * covariance, noise[:-1])
         return CorrelatedTrackingTruth(truth, measurement, None, scale)
-
-    def open_loop(self, horizon: int) -> Array:
-        """Return the bound of the mean error variance (n,) of predictions over t = 1..horizon."""
-        return self.dynamics.open_loop(horizon)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`Plant`."""
@@ -242,21 +238,15 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         prior = state.prior_covariance
         own = xp.where(grant[:, None], outcomes.delivered_covariance, prior[1:])
         covariance = xp.concatenate((prior[:1], own))
-        fused = self.fusion.fuse(mean, covariance, _with_prediction(arrived))
+        active = xp.concatenate((xp.ones_like(arrived[:1]), arrived))  # and the prediction
+        fused = self.fusion.fuse(mean, covariance, active)
         mean = set_at(mean, (..., 0, _ALL, _ALL), fused.mean)
         covariance = set_at(covariance, (..., 0, _ALL, _ALL, _ALL), fused.covariance)
         joint = state.joint
         if self.joint is not None and joint is not None:
             joint = self.joint.update(joint, outcomes.gain, arrived)
             joint = self.joint.fuse(joint, fused.gains)
-        return replace(
-            state,
-            held=xp.where(grant, state.measurement, state.held),
-            age=xp.where(arrived, 0.0, state.age),
-            means=mean,
-            covariances=covariance,
-            joint=joint,
-        )
+        return state.after(arrived, means=mean, covariances=covariance, joint=joint)
 
     def read(self, state: CorrelatedTrackingEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
@@ -363,12 +353,6 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         if isinstance(self.fusion, SequentialIntersection):
             return replace(self.fusion, order=None)
         return self.fusion
-
-
-def _with_prediction(granted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Who takes part in the fusion (l + 1, N): the centre's prediction always does."""
-    xp = namespace(granted)
-    return xp.concatenate((xp.ones_like(granted[:1]), granted))
 
 
 def _deviation(covariance: Array) -> Array:

@@ -25,12 +25,12 @@ from fusion_gym.core.knowledge import (
     sensed,
 )
 from fusion_gym.namespace import namespace
-from fusion_gym.systems.markov_jump.centralised_linear import (
+from fusion_gym.systems.markov_jump.centralised import (
     Belief,
-    CentralisedLinearFilter,
+    CentralFilter,
+    InteractingModels,
     ModePrediction,
 )
-from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.system import OF_FAMILY, sampling_blocks
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator
@@ -74,7 +74,7 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
     """
 
     model: AugmentedModel
-    filter: CentralisedLinearFilter | InteractingModels
+    filter: CentralFilter
     scale: Array
     signals = CENTRAL_SIGNALS
 
@@ -168,18 +168,10 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
         sensed(state.prediction)
         taken = reception.arrived & self.model.sensors.sampled(state.time)
         # What is not taken counts for nothing, and may be no number where it is not visible.
-        xp = namespace(taken)
-        held = xp.where(taken[:, None], state.measurement, state.held)
-        belief = self.filter.update(state.belief, held[:, 0], taken, state.time)
+        after = state.after(taken)
+        belief = self.filter.update(state.belief, after.held[:, 0], taken, state.time)
         mean, covariance = self.filter.estimate(belief)
-        return replace(
-            state,
-            held=held,
-            age=xp.where(taken, 0.0, state.age),
-            belief=belief,
-            mean=mean,
-            covariance=covariance,
-        )
+        return replace(after, belief=belief, mean=mean, covariance=covariance)
 
     def read(self, state: MarkovJumpCentralEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``CENTRAL_SIGNALS``."""

@@ -20,14 +20,11 @@ from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralEstimator
-from fusion_gym.systems.markov_jump.centralised_linear import CentralisedLinearFilter
-from fusion_gym.systems.markov_jump.fading_plant import FadingPlant
-from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
+from fusion_gym.systems.markov_jump.centralised import CentralisedLinearFilter, InteractingModels
 from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
-from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
-from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.systems.markov_jump.system import MarkovJumpEstimator
+from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
+from fusion_gym.systems.markov_jump.system import FadingPlant, MarkovJumpEstimator
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.validation import ConfigurationError
 
@@ -180,7 +177,7 @@ def _estimator(
         recursion = LagRecursion.create(filters, model.plant.size)
         return MarkovJumpEstimator(*scales, model, filters, recursion, fusion)
     linear = CentralisedLinearFilter.create(model, horizon)
-    chosen = InteractingModels.create(model.plant, model.sensors) if where == "imm" else linear
+    chosen = InteractingModels.create(model) if where == "imm" else linear
     return MarkovJumpCentralEstimator(*scales, model, chosen, linear.measured(horizon))
 
 

@@ -21,9 +21,9 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import ROUNDING, Loc
 class LagCovariances(NamedTuple):
     """Covariances of the lags d_i, node i's prediction minus the centre's copy of it, at k|k-1.
 
-    ``lag`` E d_i d_jᵀ (l (l + 1)/2, a, a, N), the pairs i <= j in the order (0, 0), (0, 1), … ·
-    ``crossed`` E d_i L_jᵀ (l (l - 1), a, a, N) with the node's error L_j, the pairs i ≠ j in the
-    order (0, 1), (0, 2), …
+    ``lag`` E d_i d_jᵀ (l (l + 1)/2, a, a, N), first i = j, then the pairs i < j in the order (0,
+    1), (0, 2), … · ``crossed`` E d_i L_jᵀ (l (l - 1), a, a, N) with the node's error L_j, first
+    these pairs, then the same with i and j exchanged.
     """
 
     lag: Array
@@ -118,85 +118,70 @@ class LagRecursion:
 
     def predict(self, now: LagCovariances, sent: NDArray[np.bool_], place: Times) -> LagCovariances:
         """Return the covariances at k+1|k after ``sent`` (l, N), with the ``place`` (N,) of k."""
-        filters, silent = self.filters, 1.0 - sent
-        count, transition = len(silent), filters.transition
-        moved = linalg.transpose(transition)
-        step = take(filters.step, place)
-        innovation = take(filters.innovation_covariance, place)
+        filters, xp = self.filters, namespace(now.lag, sent)
+        silent = 1.0 - sent[:, None, None]
+        transition, count = filters.transition, len(silent)
+        nodes, step = np.arange(count), take(filters.step, place)
+        innovation = take(filters.innovation_covariance, place)[..., None, :]
         ahead = take(filters.predicted_cross, place)
-        carried: dict[tuple[int, int], Array] = {}
-        crossed, lag = [], []
-        for row, (i, j) in enumerate(_ordered(count)):
-            block = linalg.matmul(transition, now.crossed[row])
-            carried[i, j] = linalg.matvec(block, filters.measurement_matrix[j])
-            block = linalg.matmul(block, moved)
-            block -= linalg.outer(carried[i, j], step[j])
+        first, second = self._pairs
+        half, back = len(first), linalg.transpose(transition)
+        carried, crossed = [], []
+        for i, j, block in zip(
+            (first, second), (second, first), (now.crossed[:half], now.crossed[half:]), strict=True
+        ):
+            block = linalg.matmul(transition, block)
+            carried.append(linalg.matvec(block, filters.measurement_matrix[j]))
+            block = linalg.matmul(block, back)
+            block -= linalg.outer(carried[-1], step[j])
             block += linalg.outer(step[i], ahead[i, j])
             block *= silent[i]
             crossed.append(block)
-        for row, (i, j) in enumerate(_pairs(count)):
-            if i == j:
-                block = linalg.congruence(transition, now.lag[row])
-                block += linalg.outer(step[i], innovation[i, i] * step[i])
-                block *= silent[i]
-            else:
-                block = linalg.matmul(transition, now.lag[row])
-                block = linalg.matmul(block, moved)
-                block += linalg.outer(carried[i, j], step[j])
-                block += linalg.outer(step[i], carried[j, i] + innovation[i, j] * step[j])
-                block *= silent[i] * silent[j]
-            lag.append(block)
-        return LagCovariances(_stacked(lag, now.lag), _stacked(crossed, now.crossed))
+        own = linalg.congruence(transition, now.lag[:count])
+        own += linalg.outer(step, innovation[nodes, nodes] * step)
+        own *= silent
+        lag = linalg.matmul(linalg.matmul(transition, now.lag[count:]), back)
+        lag += linalg.outer(carried[0], step[second])
+        lag += linalg.outer(step[first], carried[1] + innovation[first, second] * step[second])
+        lag *= silent[first] * silent[second]
+        return LagCovariances(xp.concatenate((own, lag)), xp.concatenate(crossed))
 
     def prediction(self, now: LagCovariances, place: Times) -> JointPrediction:
         """Return the covariances after the nodes' update at the time with the ``place`` (N,)."""
-        filters, n, count = self.filters, self.states, len(self.filters.gain)
-        shape = (count, count, n, n, len(place))
-        gain = take(self.gain, place)
-        innovation = take(filters.innovation_covariance, place)
+        filters, xp, count = self.filters, namespace(now.lag, place), len(self.filters.gain)
+        nodes, gain = np.arange(count), take(self.gain, place)
+        innovation = take(filters.innovation_covariance, place)[..., None, :]
         filtered = take(self.filtered_cross, place)
-        crossed: dict[tuple[int, int], Array] = {}
-        lag: dict[tuple[int, int], Array] = {}
-        observed: dict[tuple[int, int], Array] = {}
-        for row, (i, j) in enumerate(_ordered(count)):
-            rows = _collapse(now.crossed[row], n)
-            observed[i, j] = linalg.matvec(rows, filters.measurement_matrix[j])
-            block = _collapse(rows.swapaxes(0, 1), n).swapaxes(0, 1)
-            block = block - linalg.outer(observed[i, j], gain[j])
-            block += linalg.outer(gain[i], filtered[i, j])
-            crossed[i, j] = block
-        for row, (i, j) in enumerate(_pairs(count)):
-            block = _collapse(_collapse(now.lag[row], n).swapaxes(0, 1), n).swapaxes(0, 1)
-            right = innovation[i, j] * gain[j]
-            if i != j:
-                block = block + linalg.outer(observed[i, j], gain[j])
-                right += observed[j, i]
-            lag[i, j] = block + linalg.outer(gain[i], right)
-            if i != j:
-                lag[j, i] = linalg.transpose(lag[i, j])
-        nothing, pairs = np.zeros(shape[2:]), list(np.ndindex(count, count))
-        whole = [
-            _stacked([blocks.get(pair, nothing) for pair in pairs], now.lag).reshape(shape)
-            for blocks in (crossed, lag)
-        ]
-        return JointPrediction(take(self.local, place), whole[0], whole[1], take(self.floor, place))
+        first, second = self._pairs
+        half, i, j = len(first), np.append(first, second), np.append(second, first)
+        rows = self._collapse(now.crossed)
+        observed = linalg.matvec(rows, filters.measurement_matrix[j])
+        crossed = self._collapse(rows.swapaxes(1, 2)).swapaxes(1, 2)
+        crossed = crossed - linalg.outer(observed, gain[j])
+        crossed += linalg.outer(gain[i], filtered[i, j])
+        lag = self._collapse(self._collapse(now.lag).swapaxes(1, 2)).swapaxes(1, 2)
+        own, lag = lag[:count], lag[count:]
+        own = own + linalg.outer(gain, innovation[nodes, nodes] * gain)
+        right = innovation[first, second] * gain[second] + observed[half:]
+        lag = lag + linalg.outer(observed[:half], gain[second])
+        lag += linalg.outer(gain[first], right)
+        places = np.concatenate((nodes * (count + 1), i * count + j))
+        order = places.argsort().reshape(count, count)
+        return JointPrediction(
+            take(self.local, place),
+            xp.concatenate((xp.zeros_like(own), crossed))[order],
+            xp.concatenate((own, lag, linalg.transpose(lag)))[order],
+            take(self.floor, place),
+        )
 
+    @property
+    def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Nodes i and j of the pairs i < j."""
+        first, second = np.triu_indices(len(self.filters.gain), 1)
+        return first, second
 
-def _stacked(blocks: list[Array], before: Array) -> Array:
-    """Return the blocks as one array, or ``before`` if there are none."""
-    if not blocks:
-        return before
-    return namespace(before).concatenate(blocks).reshape(-1, *blocks[0].shape)
-
-
-def _ordered(count: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(count) for j in range(count) if i != j]
-
-
-def _pairs(count: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(count) for j in range(i, count)]
-
-
-def _collapse(rows: Array, states: int) -> Array:
-    """Return the sum of the modes' parts of the first axis: (modes · n, ...) to (n, ...)."""
-    return linalg.total(rows.reshape(-1, states, *rows.shape[1:]), 0)
+    def _collapse(self, rows: Array) -> Array:
+        """Return the sum of the modes' parts of the second axis: (p, a, ...) to (p, n, ...)."""
+        pairs, size, *rest = rows.shape
+        parts = rows.reshape(pairs, size // self.states, self.states, *rest)
+        return linalg.total(parts, 1)

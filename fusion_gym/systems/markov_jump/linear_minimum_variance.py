@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.namespace import namespace, take
-from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
-from fusion_gym.systems.markov_jump.sensors import FadingSensors
+from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 
 Times = NDArray[np.int64]
 
@@ -169,18 +168,6 @@ def _diagonal_blocks(blocks: Array) -> Array:
     return result.reshape(count * size, count * size)
 
 
-class FilterUpdate(NamedTuple):
-    """The nodes' posteriors.
-
-    ``mean`` ζ̂(k|k) (l, a, N) · ``noise_mean`` ŵ(k|k) (l, r, N) · ``innovation`` ε (l, N), zero
-    where a sensor does not sample.
-    """
-
-    mean: Array
-    noise_mean: Array
-    innovation: Array
-
-
 @dataclass(frozen=True)
 class LocalFilters:
     r"""Best linear filters at the nodes, with the joint covariance of their errors.
@@ -289,8 +276,10 @@ class LocalFilters:
 
     def update(
         self, mean: Array, measurement: Array, sampled: NDArray[np.bool_], place: Times
-    ) -> FilterUpdate:
-        """Return the posteriors after the measurements (l, N) of the ``sampled`` (l, N) sensors.
+    ) -> tuple[Array, Array, Array]:
+        """Return ζ̂(k|k) (l, a, N), ŵ(k|k) (l, r, N) and the innovations (l, N).
+
+        An innovation is zero where a sensor is not ``sampled`` (l, N).
 
         Source: markov_jump, equations (12), (13), (17).
         """
@@ -298,7 +287,7 @@ class LocalFilters:
         innovation = namespace(sampled, surprise).where(sampled, surprise, 0.0)
         correction = take(self.gain, place) * innovation[:, None]
         noise_mean = take(self.noise_gain, place) * innovation[:, None]
-        return FilterUpdate(mean + correction, noise_mean, innovation)
+        return mean + correction, noise_mean, innovation
 
 
 class _Row(NamedTuple):

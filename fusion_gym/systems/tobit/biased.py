@@ -27,10 +27,7 @@ from fusion_gym.systems.tobit.options import (
     FeedbackOptions,
     at_the_nodes,
     classes,
-    make_centre,
-    make_parts,
-    memory_filter_estimator,
-    stochastic_defaults,
+    feedback_scenario,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
@@ -145,17 +142,13 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
     censoring_upper: ArrayLike = ((1000.0,), (200.0,))
 
 
-def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
-    """Return the oscillator's scenario."""
-    return _build(options)
-
-
 def build_biased_tracking(options: BiasedTrackingOptions) -> Scenario:
     """Return the target's scenario."""
-    return _build(options)
+    return build_biased_oscillator(options)
 
 
-def _build(options: BiasedOscillatorOptions) -> Scenario:
+def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
+    """Return the oscillator's scenario."""
     horizon = validation.horizon(options.horizon)
     plant, states = _augmented(options, aware=True)
     model = plant if options.bias_aware else _augmented(options, aware=False)[0]
@@ -170,20 +163,18 @@ def _build(options: BiasedOscillatorOptions) -> Scenario:
         options.censoring_upper,
     )
     biases = plant.size - states
-    centre = make_centre(options.filter, _FILTERS, options, sensors)
     own = ("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))
-    names, random = numbered_states(states) + own, options.random_start
-    truth, estimator = make_parts(options, plant, centre, names, _REFERENCE_HORIZON, model, random)
-    weights = equal_weights(plant.open_loop(horizon))
-    memory = memory_filter_estimator(estimator, options.memory_filter, _FILTERS, options)
-    return Scenario(
+    return feedback_scenario(
         options,
-        truth,
-        estimator,
-        weights,
-        stochastic_defaults(options),
-        feedback=True,
-        memory_estimator=memory,
+        _FILTERS,
+        plant,
+        sensors,
+        numbered_states(states) + own,
+        _REFERENCE_HORIZON,
+        memory_filter=options.memory_filter,
+        random_start=options.random_start,
+        model=model,
+        state_weights=equal_weights(plant.open_loop(horizon)),
     )
 
 

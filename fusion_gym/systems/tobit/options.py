@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, plain_options
+from fusion_gym.core.options import PaperOptions, Scenario, plain_options
 from fusion_gym.errors import forbidden
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
@@ -77,21 +77,45 @@ def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
     return {name: row.kind for name, row in filters.items()}
 
 
-def make_centre(
-    kind: str, filters: Mapping[str, Filter], options: FeedbackOptions, sensors: CensoredSensors
-) -> Centre:
-    """Return the centre of the option ``filter``.
+def feedback_scenario(
+    options: Any,
+    filters: Mapping[str, Filter],
+    plant: LinearPlant,
+    sensors: CensoredSensors,
+    state_names: tuple[str, ...],
+    reference_horizon: int,
+    *,
+    memory_filter: str | None,
+    policy_defaults: Mapping[str, dict[str, Any]] | None = None,
+    random_start: bool = False,
+    model: LinearPlant | None = None,
+    known_start: bool = False,
+    **others: Any,
+) -> Scenario:
+    """Return the scenario of a linear plant, its sensors and the option ``filter``.
+
+    Options of the memory's filter are the environment's own where both filters have them, and
+    otherwise defaults.
 
     Args:
-        kind: the filter's name.
-        filters: the table of filters.
         options: options of the environment.
+        filters: the table of filters.
+        plant: the true plant.
         sensors: the sensors.
+        state_names: names of the states.
+        reference_horizon: steps without transmissions whose variances scale observed variances.
+        memory_filter: name of the memory's filter, or None for the same filter.
+        policy_defaults: parameters of policies.
+        random_start: whether the initial mean has a random direction.
+        model: the plant that the filters assume, by default ``plant``.
+        known_start: whether the estimate begins with the first measurement of every sensor.
+        **others: other fields of the scenario.
 
     Raises:
-        ConfigurationError: an unknown filter, or an option of another filter.
+        ConfigurationError: an unknown filter, an option of another filter, or a departure of the
+            truth that is not allowed or has no effect.
     """
-    choice("filter", kind, filters)
+    kind = choice("filter", options.filter, filters)
     where = f"filter={kind!r}"
     for name, row in filters.items():
         if name != kind:
@@ -99,73 +123,37 @@ def make_centre(
     if not filters[kind].nodes:
         belongs = "a filter with nodes (here the centre uses the measurements)"
         _refuse(options, _OF_FUSION, where, belongs)
-    return filters[kind].make(options, sensors)
-
-
-def make_parts(
-    options: FeedbackOptions,
-    plant: LinearPlant,
-    centre: Centre,
-    state_names: tuple[str, ...],
-    reference_horizon: int,
-    model: LinearPlant | None = None,
-    random_start: bool = False,
-) -> tuple[CensoredPlant, CensoredEstimator]:
-    """Return plant and estimator of a linear plant and a centre.
-
-    Args:
-        options: options of the environment.
-        plant: the true plant.
-        centre: nodes and centre.
-        state_names: names of the states.
-        reference_horizon: steps without transmissions whose variances scale observed variances.
-        model: the plant that the filters assume, by default ``plant``.
-        random_start: whether the initial mean has a random direction.
-
-    Raises:
-        ConfigurationError: a departure of the truth that is not allowed, or has no effect.
-    """
-    absent = ("true_threshold_shift",) if centre.sensors.unlimited else ()
+    centre = filters[kind].make(options, sensors)
+    absent = ("true_threshold_shift",) if sensors.unlimited else ()
     nature = Nature.create(options, (*plant.unmoved, *absent))
     nature.check_growth(plant.true_radius, options.horizon)
-    plant.warn_of_unseen_growth(centre.sensors.stacked_matrix, state_names)
+    plant.warn_of_unseen_growth(sensors.stacked_matrix, state_names)
     estimator = CensoredEstimator(
         model=plant if model is None else model,
         centre=centre,
         state_names=state_names,
         scale=typical_magnitude(plant, options.horizon, random_start),
         reference=plant.open_loop(min(options.horizon, reference_horizon)),
+        known_start=known_start,
     )
-    return CensoredPlant(plant, centre.sensors, state_names, random_start, nature), estimator
-
-
-def memory_filter_estimator(
-    estimator: CensoredEstimator,
-    kind: str | None,
-    filters: Mapping[str, Filter],
-    options: FeedbackOptions,
-) -> CensoredEstimator | None:
-    """Return the estimator with the filter of the option ``memory_filter``, or ``None``.
-
-    Its options are the environment's own where both filters have them, and otherwise defaults.
-
-    Args:
-        estimator: the estimator.
-        kind: name of the memory's filter, or None.
-        filters: the table of filters.
-        options: options of the environment.
-
-    Raises:
-        ConfigurationError: an unknown filter, or a missing option.
-    """
-    if kind is None:
-        return None
-    row = filters[choice("memory_filter", kind, filters)]
-    changed: dict[str, Any] = {"filter": kind}
-    if not row.nodes:
-        changed |= dict.fromkeys(_OF_FUSION)
-    made = row.make(replace(options, **changed), estimator.centre.sensors)
-    return replace(estimator, centre=made)
+    memory = None
+    if memory_filter is not None:
+        row = filters[choice("memory_filter", memory_filter, filters)]
+        changed: dict[str, Any] = dict.fromkeys(() if row.nodes else _OF_FUSION)
+        changed["filter"] = memory_filter
+        memory = replace(estimator, centre=row.make(replace(options, **changed), sensors))
+    defaults = dict(policy_defaults or {})
+    if options.stochastic_weight is not None:
+        defaults["stochastic_event"] = {"weight": plain_options(options.stochastic_weight)}
+    return Scenario(
+        options,
+        CensoredPlant(plant, sensors, state_names, random_start, nature),
+        estimator,
+        policy_defaults=defaults,
+        feedback=True,
+        memory_estimator=memory,
+        **others,
+    )
 
 
 def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
@@ -189,13 +177,6 @@ def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
         return FeedbackCentre(node, share, fusion)
     _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
     return FeedbackCentre(node, np.ones((sensors, 1)), fusion)
-
-
-def stochastic_defaults(options: FeedbackOptions) -> dict[str, dict[str, Any]]:
-    """Return the parameters of the policy ``stochastic_event``, if the filter uses it."""
-    if options.stochastic_weight is None:
-        return {}
-    return {"stochastic_event": {"weight": plain_options(options.stochastic_weight)}}
 
 
 # What every environment of the family offers; each adds its paper's own.

@@ -18,20 +18,16 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.parts import numbered_states, trigger_parameters
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.options import (
     FILTERS,
-    Centre,
     FeedbackOptions,
     Filter,
     at_the_nodes,
     classes,
     feedback_centre,
-    make_centre,
-    make_parts,
-    memory_filter_estimator,
-    stochastic_defaults,
+    feedback_scenario,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
@@ -141,23 +137,27 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
         plant.size,
     )
     trigger = _trigger(options, sensors.count)
-    centre = _centre(options, sensors)
-    holds = options.filter == "paper" and options.silent != "predict"
+    for name, refused in (("silent", "hold"), ("event_error", True)):
+        if options.filter != "paper" and getattr(options, name) == refused:
+            raise ConfigurationError(
+                f"{name} = {refused!r} is not allowed with filter={options.filter!r}: it belongs "
+                "to filter='paper' (the others predict in silence, without an event error)"
+            )
     memory_filter = options.memory_filter
     if memory_filter is None and options.filter == "paper":
         # The paper's minimises a bound; with every measurement it errs thrice.
         memory_filter = "adf"
-    names, random = numbered_states(plant.size), options.random_start
-    truth, estimator = make_parts(options, plant, centre, names, horizon, random_start=random)
-    memory = memory_filter_estimator(estimator, memory_filter, _FILTERS, options)
-    defaults = {"dynamic_event": trigger} | stochastic_defaults(options)
-    return Scenario(
+    holds = options.filter == "paper" and options.silent != "predict"
+    return feedback_scenario(
         options,
-        truth,
-        estimator,
-        policy_defaults=defaults,
-        feedback=True,
-        memory_estimator=memory,
+        _FILTERS,
+        plant,
+        sensors,
+        numbered_states(plant.size),
+        horizon,
+        memory_filter=memory_filter,
+        policy_defaults={"dynamic_event": trigger},
+        random_start=options.random_start,
         no_estimates=_HELD if holds else None,
     )
 
@@ -174,17 +174,6 @@ def _plant(options: TobitOscillatorOptions) -> LinearPlant:
     return LinearPlant.create(
         transition, covariance, options.initial_mean, options.initial_covariance
     )
-
-
-def _centre(choice: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
-    centre = make_centre(choice.filter, _FILTERS, choice, sensors)
-    for name, refused in (("silent", "hold"), ("event_error", True)):
-        if choice.filter != "paper" and getattr(choice, name) == refused:
-            raise ConfigurationError(
-                f"{name} = {refused!r} is not allowed with filter={choice.filter!r}: it belongs "
-                "to filter='paper' (the others predict in silence, without an event error)"
-            )
-    return centre
 
 
 def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
@@ -217,13 +206,5 @@ def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> Non
 
 def _trigger(options: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
     """Return the parameters of the dynamic event trigger, one number per sensor."""
-    paper = {"threshold": (0.1, 0.2, 0.3), "decay": (0.1, 0.2, 0.1)}
-    result = {}
-    for name in ("threshold", "decay", "divisor", "initial"):
-        field = f"trigger_{name}"
-        value = getattr(options, field)
-        if value is None and name in paper:
-            value = np.resize(paper[name], sensors)
-        values = validation.not_negative(field, value, (sensors,))
-        result[name] = tuple(values.tolist())
-    return result
+    usual = {"threshold": (0.1, 0.2, 0.3), "decay": (0.1, 0.2, 0.1)}
+    return trigger_parameters(options, (*usual, "divisor", "initial"), sensors, usual)

@@ -101,10 +101,6 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
         measurement = self.sensors.measure(truth, own, departure)
         return Truth(truth, measurement, departure)
 
-    def open_loop(self, horizon: int) -> Array:
-        """Return the mean error variance (n,) of predictions over t = 1..horizon."""
-        return self.dynamics.open_loop(horizon)
-
     def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`Plant`."""
         sensors, size = self.sensors, self.dynamics.size
@@ -349,18 +345,11 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         prior, prediction = (state.prior_mean, state.prior_covariance), sensed(state.prediction)
         if self.reads_silence:
             prediction = prediction._replace(possible=reception.possible)
-        arrived, xp = reception.arrived, namespace(reception.arrived)
+        arrived = reception.arrived
         if state.available is not None:
             arrived = arrived & state.available
         mean, covariance = self.centre.update(prior, prediction, state.measurement, arrived)
-        return replace(
-            state,
-            prediction=prediction,
-            held=xp.where(arrived[:, None], state.measurement, state.held),
-            age=xp.where(arrived, 0.0, state.age),
-            mean=mean,
-            covariance=covariance,
-        )
+        return state.after(arrived, prediction=prediction, mean=mean, covariance=covariance)
 
     def single_deliveries(self, state: CensoredEstimate) -> tuple[Array, Array] | None:
         """See :class:`Estimator`."""
@@ -382,7 +371,7 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
             prior = state.prior_mean, state.prior_covariance
             return self.centre.variances(prior, sensed(state.prediction), self.state_weights)
 
-        values = {
+        values: dict[str, Any] = {
             **super().read(state, failure),
             "innovation": lambda: state.measurement - expectation.value,
             "censored": lambda: self.centre.sensors.censored(state.measurement),

@@ -2,17 +2,18 @@
 
 Source: unknown_input, Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", Frontiers of
-Information Technology & Electronic Engineering 24, 2023.
+Information Technology & Electronic Engineering 24, 2023, Section 4.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import expm
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
@@ -22,14 +23,15 @@ from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.errors import forbidden
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.parts import numbered_states
-from fusion_gym.systems.unknown_input.bound_filter import BoundTables
-from fusion_gym.systems.unknown_input.examples import EXAMPLES
-from fusion_gym.systems.unknown_input.filters import ExactInputStateFilter, RandomWalkInputFilter
-from fusion_gym.systems.unknown_input.fusion import NodeFusion
-from fusion_gym.systems.unknown_input.input_state import InputModel, JointGain
-from fusion_gym.systems.unknown_input.nodes import Nodes, RunNodes, TableNodes
-from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
-from fusion_gym.systems.unknown_input.sensors import InputSensors
+from fusion_gym.systems.unknown_input.filters import (
+    BoundTables,
+    ExactInputStateFilter,
+    InputModel,
+    JointGain,
+    RandomWalkInputFilter,
+)
+from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
+from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import (
     ArrayInput,
     InputSignal,
@@ -39,6 +41,91 @@ from fusion_gym.systems.unknown_input.signals import (
 )
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 from fusion_gym.validation import ConfigurationError
+
+
+def two_carts(step: float = 0.25) -> tuple[Array, Array, Array]:
+    """Two carts of 1 kg in a row: transition, input matrix and process covariance of one step.
+
+    States: position and velocity of cart 1 and of cart 2, in m and m/s. A spring of 1 N/m with a
+    damper of 0.6 N s/m ties cart 1 to a wall and another such pair ties the carts together. The
+    unknown input is a force on cart 1, in N; white forces of the spectral density 0.02 N² s shake
+    both carts. ``step`` is in seconds, the discretisation exact.
+    """
+    stiffness, damping, density = 1.0, 0.6, 0.02
+    drift = np.array(
+        [
+            [0.0, 1.0, 0.0, 0.0],
+            [-2 * stiffness, -2 * damping, stiffness, damping],
+            [0.0, 0.0, 0.0, 1.0],
+            [stiffness, damping, -stiffness, -damping],
+        ]
+    )
+    force = np.array([[0.0], [1.0], [0.0], [0.0]])
+    noise = density * np.diag([0.0, 1.0, 0.0, 1.0])
+    moved = expm(np.block([[drift, force], [np.zeros((1, 5))]]) * step)
+    # Van Loan's integral of exp(F t) G exp(F t)ᵀ
+    pair = expm(np.block([[-drift, noise], [np.zeros((4, 4)), drift.T]]) * step)
+    process = pair[4:, 4:].T @ pair[:4, 4:]
+    return moved[:4, :4], moved[:4, 4:], (process + process.T) / 2
+
+
+def _examples() -> dict[str, dict[str, Any]]:
+    transition, inputs, process = two_carts()
+    carts = {
+        "transition": transition.tolist(),
+        "input_matrix": inputs.tolist(),
+        "process_covariance": process.tolist(),
+        "initial_mean": (0.0, 0.0, 0.0, 0.0),
+        "initial_covariance": np.diag([0.1, 0.1, 0.1, 0.1]).tolist(),
+        # Cart 1; the velocity of cart 1 with the position of cart 2; the damper with cart 2
+        "measurement_matrices": (
+            ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)),
+            ((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+            ((0.0, 1.0, 0.0, -1.0), (0.0, 0.0, 1.0, 0.0)),
+        ),
+        "measurement_covariance": ((0.0009, 0.0064), (0.0036, 0.0036), (0.0064, 0.0009)),
+        "filter": "random_walk",
+        "young_factor": 0.2,
+        "input_memory": 0.9,
+        "input_change": 0.3,
+        "input_deviation": 0.7,
+        "rho_bar": 0.09,
+        "rho_initial": 0.04,
+        "adaptation": 0.04,
+        "signals": {
+            "sinusoids": (((0.8, 0.6),), ((60.0, 25.0),), "random"),
+            "steps": (0.7, 20.0, "random"),
+            "random_walk": (0.7, 10.0, "random"),
+        },
+    }
+    paper = {
+        "transition": ((0.26, 0.3), (0.2, 0.1)),
+        "input_matrix": ((1.10, 1.12), (1.15, 1.13)),
+        "process_covariance": ((0.001, 0.0), (0.0, 0.001)),
+        "initial_mean": (0.17, 0.17),
+        "initial_covariance": ((0.01, 0.0), (0.0, 0.01)),
+        "initial_half_width": 0.01,
+        "measurement_matrices": (((1.12, 1.13), (1.10, 1.12)), ((1.31, 1.13), (1.31, 1.21))),
+        "measurement_covariance": 0.001,
+        "filter": "paper",
+        "young_factor": 1.0,
+        "input_memory": 1.0,
+        "input_change": 0.02,
+        "input_deviation": 0.1,
+        "rho_bar": 0.05,
+        "rho_initial": 0.01,
+        "adaptation": 0.01,
+        "signals": {
+            "sinusoids": (0.1, ((50.0,), (35.0,)), ((0.0,), (1.0,))),
+            "steps": (0.1, 20.0, "random"),
+            "random_walk": (0.1, 10.0, "random"),
+        },
+    }
+    return {"two_carts": carts, "paper": paper}
+
+
+EXAMPLES = _examples()
+
 
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
 _SHAPE = ("input_amplitude", "input_period", "input_phase")  # of a signal by its name
@@ -68,7 +155,7 @@ class UnknownInputOptions(PaperOptions):
     measurement at time 0 has been delivered.
 
     ``None`` stands for the number of the chosen ``example``, which
-    :mod:`fusion_gym.systems.unknown_input.examples` lists.
+    :mod:`fusion_gym.systems.unknown_input.environment` lists.
 
     Example:
         >>> import fusion_gym
@@ -145,14 +232,22 @@ class UnknownInputOptions(PaperOptions):
     """Weight of an input's error in the reward, where a state's is 1."""
 
 
-def build_unknown(options: UnknownInputOptions) -> Scenario:
+def build_unknown(choice: UnknownInputOptions) -> Scenario:
     """Return the scenario of these options."""
-    options = _with_example(options)
+    options = _with_example(choice)
     horizon = validation.horizon(options.horizon)
-    plant = _plant(options)
+    plant = UnknownInputPlant.create(
+        options.transition,
+        options.input_matrix,
+        options.process_covariance,
+        options.sampling_period,
+        options.initial_mean,
+        options.initial_covariance,
+        options.initial_half_width,
+    )
     signal = _signal(options, plant.inputs, horizon)
     sensors = InputSensors.create(
-        _required(options.measurement_matrices), _required(options.measurement_covariance), plant
+        options.measurement_matrices, options.measurement_covariance, plant
     )
     trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
@@ -176,7 +271,14 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
         magnitude=plant.magnitude(signal, horizon),
         reference=open_loop,
     )
-    memory = _with_memory_filter(options, estimator, plant, horizon)
+    # The paper's filter minimises a bound; its memory has the random walk's.
+    kind, memory = options.memory_filter, None
+    if kind is None and options.filter == "paper":
+        kind = "random_walk"
+    if kind is not None:
+        validation.choice("memory_filter", kind, FILTERS)
+        other = replace(options, filter=kind, hold_variance=None)
+        memory = replace(estimator, nodes=_nodes(other, plant, sensors, horizon))
     return Scenario(
         options,
         truth,
@@ -188,26 +290,7 @@ def build_unknown(options: UnknownInputOptions) -> Scenario:
     )
 
 
-def _with_memory_filter(
-    options: UnknownInputOptions,
-    estimator: UnknownInputEstimator,
-    plant: UnknownInputPlant,
-    horizon: int,
-) -> UnknownInputEstimator | None:
-    """Return the estimator with the filter of ``memory_filter``, or ``None`` for the same filter.
-
-    The paper's filter, which minimises a bound, uses the random walk's.
-    """
-    usual = "random_walk" if options.filter == "paper" else None
-    kind = usual if options.memory_filter is None else options.memory_filter
-    if kind is None:
-        return None
-    validation.choice("memory_filter", kind, FILTERS)
-    other = replace(options, filter=kind, hold_variance=None)
-    return replace(estimator, nodes=_nodes(other, plant, estimator.nodes.sensors, horizon))
-
-
-def _with_example(options: UnknownInputOptions) -> UnknownInputOptions:
+def _with_example(options: UnknownInputOptions) -> Any:
     """Return the options with the example's numbers in place of ``None``."""
     example = EXAMPLES[validation.choice("example", options.example, EXAMPLES)]
     numbers = {name: value for name, value in example.items() if name != "signals"}
@@ -219,24 +302,6 @@ def _with_example(options: UnknownInputOptions) -> UnknownInputOptions:
         numbers.pop("initial_half_width", None)
     missing = {name: value for name, value in numbers.items() if getattr(options, name) is None}
     return replace(options, **missing)
-
-
-def _plant(options: UnknownInputOptions) -> UnknownInputPlant:
-    return UnknownInputPlant.create(
-        _required(options.transition),
-        _required(options.input_matrix),
-        _required(options.process_covariance),
-        options.sampling_period,
-        _required(options.initial_mean),
-        _required(options.initial_covariance),
-        options.initial_half_width,
-    )
-
-
-def _required(value: ArrayLike | None) -> ArrayLike:
-    """Return a number that the example has filled in."""
-    assert value is not None, "every example has all numbers"
-    return value
 
 
 def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
@@ -258,16 +323,11 @@ def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSig
     return MeanRevertingWalk.create(inputs, amplitude, period)
 
 
-def _nodes(
-    options: UnknownInputOptions, plant: UnknownInputPlant, sensors: InputSensors, horizon: int
-) -> Nodes:
+def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:
     kind = validation.choice("filter", options.filter, FILTERS)
-    factor = validation.positive("young_factor", _required(options.young_factor), (sensors.count,))
+    factor = validation.positive("young_factor", options.young_factor, (sensors.count,))
     model = InputModel.create(
-        plant,
-        _required(options.input_memory),
-        _required(options.input_change),
-        _required(options.input_deviation),
+        plant, options.input_memory, options.input_change, options.input_deviation
     )
     joint = JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
@@ -278,7 +338,7 @@ def _nodes(
         reason = "it belongs to filter='random_walk'"
         raise forbidden("hold_variance", hold, reason, f"with filter={kind!r}")
     if kind == "paper":
-        bound = _required(options.rho_bar)
+        bound = options.rho_bar
         tables = BoundTables.create(joint, model, bound, factor, horizon)
         return TableNodes.create(model, sensors, tables, fusion)
     if kind == "predict":
@@ -296,11 +356,11 @@ def _nodes(
     return RunNodes(model, sensors, RandomWalkInputFilter(model, sensors), fusion, hold)
 
 
-def _trigger(options: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:
+def _trigger(options: Any, sensors: int) -> dict[str, tuple[float, ...]]:
     """Return the parameters of the adaptive threshold trigger, one number per sensor."""
     names = ("rho_bar", "rho_initial", "adaptation")
     spread = {
-        name: tuple(validation.spread(name, _required(getattr(options, name)), (sensors,)).tolist())
+        name: tuple(validation.spread(name, getattr(options, name), (sensors,)).tolist())
         for name in names
     }
     validation.adaptive_thresholds(*spread.values())

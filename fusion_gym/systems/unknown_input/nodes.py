@@ -1,28 +1,189 @@
-"""The nodes of an unknown-input system with their fusion centre, behind one interface.
+"""The nodes of an unknown-input system, and the fusion of their estimates at the centre.
 
-:class:`TableNodes` reads tables that all runs share; :class:`RunNodes` has a covariance for every
-node and run. Nodes get no feedback.
+State and input are fused separately, each by (24) with weights of the smallest trace (25). The
+cross-covariance of the two results is unknown and set to zero. :class:`TableNodes` reads tables
+that all runs share; :class:`RunNodes` has a covariance for every node and run. Nodes get no
+feedback.
 
-Source: unknown_input, equations (8), (24), (25).
+Source: unknown_input, equations (8), (24)-(26).
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.namespace import namespace, take
-from fusion_gym.systems.unknown_input.bound_filter import BoundTables
-from fusion_gym.systems.unknown_input.filters import ExactInputStateFilter, RandomWalkInputFilter
-from fusion_gym.systems.unknown_input.fusion import NodeFusion
-from fusion_gym.systems.unknown_input.input_state import InputModel
-from fusion_gym.systems.unknown_input.sensors import InputSensors
+from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
+from fusion_gym.fusion.several import (
+    CovarianceIntersection,
+    covariance_intersection_many,
+    is_regular,
+)
+from fusion_gym.namespace import in_runs, namespace, put_runs, set_at, take
+from fusion_gym.systems.unknown_input.filters import (
+    BoundTables,
+    ExactInputStateFilter,
+    InputModel,
+    RandomWalkInputFilter,
+)
+from fusion_gym.systems.unknown_input.plant import InputSensors
+
+_GAP = 0.01  # relative gap at which the tracked weights rest
+_STEPS = 4  # evaluations of the tracked weights at a time, at most
+_FLOOR = 1e-3  # a tracked weight stays above, so that it can come back
+
+
+@dataclass(frozen=True)
+class NodeFusion(FusionRule):
+    """The centre's rule for l nodes with n states and q inputs.
+
+    ``rule`` joins the ``states`` n entries of the nodes' states, and their inputs. With
+    :class:`~fusion_gym.fusion.several.CovarianceIntersection` and ``tracked``, its weights follow
+    the smallest trace from one time to the next (:func:`tracked_intersection`), starting from the
+    weights of :meth:`going_on`.
+
+    Covariance intersection gives a bound for every correlation of the nodes' errors, provided that
+    the nodes' covariances are bounds. Its inverse form does not, because the errors share process
+    noise.
+    """
+
+    rule: FusionRule
+    states: int
+    tracked: bool = False
+    state_weights: Array | None = None
+    weights: Array | None = None
+
+    def start(self, nodes: int, runs: int) -> Array | None:
+        """Return equal weights (l, N) if weights are tracked."""
+        return np.full((nodes, runs), 1.0 / nodes) if self.tracked else None
+
+    def going_on(self, weights: Array | None) -> NodeFusion:
+        """Return the rule that starts from the last weights (l, N)."""
+        return self if weights is None else replace(self, weights=weights)
+
+    def fuse(
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
+    ) -> Fused:
+        """See :class:`~fusion_gym.fusion.rules.FusionRule`, for means (l, s, N), s = n + q.
+
+        The covariance has zero blocks between state and input. Tracked weights are the state's.
+        """
+        n, own = self.states, own_covariances(covariance)
+        ranges = slice(n), slice(n, None)
+        part = self.state_weights
+        every = (None, None) if part is None else (part[:n], part[n:])
+        state = self._block(means[:, :n], own[:, :n, :n], active, every[0])
+        inputs = self._block(means[:, n:], own[:, n:, n:], active, every[1])
+        xp, blocks = namespace(means, own), [(..., part, part, slice(None)) for part in ranges]
+
+        def joined(*parts: Array) -> Array:
+            whole = xp.zeros((*parts[0].shape[:-3], *own.shape[1:]))
+            for block, part in zip(blocks, parts, strict=True):
+                whole = set_at(whole, block, part)
+            return whole
+
+        return Fused(
+            xp.concatenate((state.mean, inputs.mean)),
+            joined(state.covariance, inputs.covariance),
+            lambda: joined(state.gains, inputs.gains),
+            state.weights if self.tracked else None,
+        )
+
+    def _block(
+        self, means: Array, own: Array, active: NDArray[np.bool_] | None, state: Array | None
+    ) -> Fused:
+        rule = self.rule.with_weights(state)
+        if active is not None:
+            return rule.fuse(means, own, active)
+        ones = np.ones((1, means.shape[-1]))
+        if len(means) == 1:
+            identity = linalg.identity(means.shape[1]) * ones
+            return Fused(means[0], own[0], lambda: identity[None], ones)
+        if isinstance(rule, CovarianceIntersection):
+            if means.shape[1] == 1:
+                return _smallest_variance(means, own)
+            if self.weights is not None:
+                return tracked_intersection(means, own, self.weights, rule.metric(own, None))
+        return rule.fuse(means, own)
+
+
+def _smallest_variance(mean: Array, covariance: Array) -> Fused:
+    """Return the covariance intersection of scalars: the smallest variance, or equal shares."""
+    smallest = covariance.min(0)
+    selection = (covariance == smallest)[:, 0, 0]
+    weights = selection / linalg.total(selection * 1.0)
+    joined = linalg.total(weights[:, None] * mean, 0)
+    return Fused(joined, smallest, lambda: weights[:, None, None], weights)
+
+
+@np.errstate(all="ignore")
+def tracked_intersection(
+    mean: Array, covariance: Array, weights: Array, basis: Array | None = None
+) -> Fused:
+    """Return the covariance intersection with weights that follow the smallest trace over time.
+
+    From the given weights (l, N), w_i ← w_i √tr(P Y_i P), normalised, with Y_i = P_i⁻¹ and P = (Σ
+    w_i Y_i)⁻¹, until the trace of P is within 1 % of its minimum: the gap is at most max_i tr(P Y_i
+    P) - tr P. A call makes at most four evaluations; the next call continues. Every P is a bound,
+    since any weights give one. For a nearly singular estimate the search is
+    :func:`covariance_intersection_many`.
+
+    Args:
+        mean: (l, n, N).
+        covariance: (l, n, n, N), symmetric positive semi-definite.
+        weights: (l, N), not negative, of sum 1.
+        basis: As in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
+    """
+    information, xp = linalg.inverse(covariance), namespace(covariance)
+    nodes, n = mean.shape[:2]
+    vectors = linalg.matvec(information, mean)
+    weights = xp.maximum(weights, _FLOOR)
+    weights /= linalg.total(weights, 0)
+    lanes: Any = slice(None)
+    fused = xp.empty_like(covariance[0])
+    for step in range(_STEPS):
+        runs = lanes if xp is np else slice(None)  # JAX computes all
+        part, some = information[..., runs], weights[:, runs]
+        bound = linalg.inverse(linalg.total(some[:, None, None] * part, 0))
+        fused = put_runs(fused, lanes, bound)
+        if step == _STEPS - 1:
+            break
+        metric = None if basis is None else basis[..., runs]
+        spread = bound if metric is None else linalg.matmul(bound, linalg.transpose(metric))
+        square = linalg.matmul(spread, linalg.transpose(spread))
+        gain = linalg.total((part * square).reshape(nodes, n * n, -1))
+        total = linalg.trace(bound if metric is None else linalg.matmul(metric, spread))
+        still = gain.max(0) > (1.0 + _GAP) * total
+        if xp is np:
+            if not still.any():
+                break
+            some, gain = some[:, still], gain[:, still]
+            lanes = np.flatnonzero(still) if isinstance(lanes, slice) else lanes[still]
+        else:
+            lanes = still if isinstance(lanes, slice) else lanes & still
+        moved = xp.maximum(some * xp.sqrt(gain), _FLOOR**2)
+        weights = put_runs(weights, lanes, moved / linalg.total(moved, 0))
+    joined = linalg.matvec(fused, linalg.total(weights[:, None] * vectors, 0))
+    singular: Any = ~is_regular(covariance, information).all(0)
+
+    def best(mean: Array, covariance: Array, basis: Array | None = None) -> tuple[Any, ...]:
+        found = covariance_intersection_many(mean, covariance, basis=basis)
+        return found.mean, found.covariance, found.weights, found.gains
+
+    arguments = (mean, covariance) if basis is None else (mean, covariance, basis)
+    results = joined, fused, weights, xp.zeros(covariance.shape)
+    joined, fused, weights, own = in_runs(singular[None], best, arguments, results)
+
+    def gains() -> Array:
+        every = linalg.matmul(fused, weights[:, None, None] * information)
+        return xp.where(singular, own, every)
+
+    return Fused(joined, fused, gains, weights)
 
 
 class Estimates(NamedTuple):
@@ -53,44 +214,11 @@ class NodePrediction(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Nodes(ABC):
-    """Nodes and centre, with the nodes' model of plant and input."""
+class _Nodes:
+    """What both kinds of nodes have: the model of plant and input, and the sensors."""
 
     model: InputModel
     sensors: InputSensors
-
-    @abstractmethod
-    def start(self, runs: int) -> Estimates:
-        """Return the estimates before any measurement."""
-
-    @abstractmethod
-    def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
-        """Return the predictions for the measurements at ``time`` (N,)."""
-
-    @abstractmethod
-    def update(
-        self,
-        estimates: Estimates,
-        prediction: NodePrediction,
-        held: Array,
-        granted: NDArray[np.bool_],
-        time: Array,
-    ) -> Estimates:
-        """Return the posteriors; ``held`` (l, m, N) are the last deliveries with the new ones."""
-
-    @abstractmethod
-    def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
-        """Return the nodes' covariances (l, s, s, N or 1) before the update at ``time``."""
-
-    @abstractmethod
-    def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
-        """Return the centre's covariance (s, s, N or 1) of the posterior at ``time``."""
-
-    @abstractmethod
-    def variances(
-        self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
-    ) -> tuple[Array, Array]:
-        """Return a silent step's fused trace (N,), weighted by (s,), and its reductions (l, N)."""
 
     def _start(self, runs: int) -> tuple[Array, Array, Array]:
         """Return the initial means (l, s, N), (s, N) and covariance (s, s, N)."""
@@ -107,7 +235,7 @@ class Nodes(ABC):
 
 
 @dataclass(frozen=True)
-class TableNodes(Nodes):
+class TableNodes(_Nodes):
     """Nodes that hold the last measurement; gains, bounds and fusion are tables over time.
 
     ``tables`` hold the nodes' gains and bounds. ``state_gain`` (l, n, n, T + 1) and ``input_gain``
@@ -154,8 +282,8 @@ class TableNodes(Nodes):
         mean, fused, _ = self._start(runs)
         return Estimates(mean, fused, None, None, None)
 
-    def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
-        """See :class:`Nodes`."""
+    def predict(self, estimates: Estimates) -> NodePrediction:
+        """Return the predictions for the next measurements."""
         return self._predict(estimates, None)
 
     def update(
@@ -166,7 +294,7 @@ class TableNodes(Nodes):
         granted: NDArray[np.bool_],
         time: Array,
     ) -> Estimates:
-        """Update every node with the held measurement as the present one.
+        """Update every node with the held measurement (l, m, N) as the present one.
 
         Source: unknown_input, equations (8), (24).
         """
@@ -190,7 +318,10 @@ class TableNodes(Nodes):
     def variances(
         self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
-        """Return the bound's trace, and its reduction where one held difference is zero."""
+        """Return the bound's trace (N,), weighted by (s,), and its reductions (l, N).
+
+        A reduction is that of one held difference that is zero.
+        """
         silent = linalg.weighted_trace(self.fused, weights)
         reduction = silent - linalg.weighted_trace(self.delivered, weights)
         rows = self._rows(time)
@@ -209,7 +340,7 @@ class TableNodes(Nodes):
 
 
 @dataclass(frozen=True)
-class RunNodes(Nodes):
+class RunNodes(_Nodes):
     """Nodes whose covariances depend on the deliveries: each run has its own.
 
     A node without a delivery predicts. With ``hold_variance`` h (l, 1, 1, 1) it instead uses the
@@ -228,8 +359,8 @@ class RunNodes(Nodes):
         weights = self.fusion.start(self.sensors.count, runs)
         return Estimates(mean, fused, every, covariance, weights)
 
-    def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
-        """See :class:`Nodes`."""
+    def predict(self, estimates: Estimates) -> NodePrediction:
+        """Return the predictions for the next measurements."""
         prior = self.model.predict_covariance(_own(estimates.covariance))
         return self._predict(estimates, prior)
 
@@ -241,7 +372,10 @@ class RunNodes(Nodes):
         granted: NDArray[np.bool_],
         time: Array,
     ) -> Estimates:
-        """Update granted nodes, predict (or hold) the others, and fuse all."""
+        """Update granted nodes, predict (or hold) the others, and fuse all.
+
+        ``held`` (l, m, N) are the last deliveries with the new ones.
+        """
         gain, covariance = self._outcome(estimates, prediction, granted)
         correction = linalg.matvec(gain, held - prediction.expected)
         if self.hold_variance is None:
@@ -264,7 +398,10 @@ class RunNodes(Nodes):
     def variances(
         self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
-        """See :class:`Nodes`; with the best fusion weights."""
+        """Return a silent step's fused trace (N,), weighted by (s,), and its reductions (l, N).
+
+        The fusion has the best weights.
+        """
         nobody = np.zeros((self.sensors.count, prediction.expected.shape[-1]), dtype=np.bool_)
         silent = _own(prediction.covariance)
         if self.hold_variance is not None:
@@ -285,6 +422,9 @@ class RunNodes(Nodes):
             extra = self.hold_variance * ~granted[:, None, None]
             noise = noise + linalg.identity(self.sensors.size) * extra
         return self.filter.update(_own(prediction.covariance), noise)
+
+
+Nodes = TableNodes | RunNodes
 
 
 def _own(value: Array | None) -> Array:

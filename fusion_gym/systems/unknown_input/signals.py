@@ -18,18 +18,16 @@ from fusion_gym.arrays import Array
 from fusion_gym.namespace import namespace, ndtr, take
 
 
+@dataclass(frozen=True)
 class InputSignal(ABC):
     """q inputs over time, for N runs at once (batch axis last).
 
     ``start`` turns standard normals (start_channels, N) into a memory (rows, N), ``value`` reads
     the input (q, N) at the runs' times (N,) from it, and ``advance`` moves the memory by one
-    sampling instant with standard normals (noise_channels, N).
+    sampling instant with standard normals (noise_channels, N). ``size`` is q.
     """
 
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """Number of inputs q."""
+    size: int
 
     @property
     def start_channels(self) -> int:
@@ -94,15 +92,11 @@ class Sinusoids(InputSignal):
             raise validation.refusal("input_phase", phase, "'random' or radians")
         shape = (size, _terms(amplitude, period, 0.0 if random else phase))
         return cls(
+            size,
             amplitude=validation.spread("input_amplitude", amplitude, shape)[..., None],
             period=validation.positive("input_period", period, shape)[..., None],
             phase=None if random else validation.spread("input_phase", phase, shape)[..., None],
         )
-
-    @property
-    def size(self) -> int:
-        """Number of inputs q."""
-        return self.amplitude.shape[0]
 
     @property
     def start_channels(self) -> int:
@@ -177,12 +171,7 @@ class _Stationary(InputSignal):
         if np.any(instants < 1.0):
             allowed = ">= 1 everywhere, because an input is constant between two sampling instants"
             raise validation.refusal("input_period", instants, allowed)
-        return cls(scale[:, None], instants[:, None])
-
-    @property
-    def size(self) -> int:
-        """Number of inputs q."""
-        return len(self.amplitude)
+        return cls(size, scale[:, None], instants[:, None])
 
     @property
     def start_channels(self) -> int:
@@ -267,12 +256,8 @@ class ArrayInput(InputSignal):
         Raises:
             ConfigurationError: another shape, or an entry that is not finite.
         """
-        return cls(validation.array("input_signal", values, (horizon + 1, size))[..., None])
-
-    @property
-    def size(self) -> int:
-        """Number of inputs q."""
-        return self.values.shape[1]
+        rows = validation.array("input_signal", values, (horizon + 1, size))
+        return cls(size, rows[..., None])
 
     def start(self, noise: Array) -> Array:
         """Return an empty memory (0, N)."""

@@ -26,8 +26,7 @@ from fusion_gym.namespace import namespace, ndtr
 from fusion_gym.systems.linear_plant import largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
-from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
-from fusion_gym.systems.unknown_input.sensors import InputSensors
+from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
 _IMAGINED = 32  # signals of which one is taken, where one is imagined
@@ -245,9 +244,8 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
 
     def predict(self, state: UnknownInputEstimate) -> UnknownInputEstimate:
         """Predict at the nodes."""
-        time = state.time + 1.0
-        prediction = self.nodes.predict(state.estimates, time)
-        return replace(state, age=state.age + 1.0, time=time, prediction=prediction)
+        prediction = self.nodes.predict(state.estimates)
+        return replace(state, age=state.age + 1.0, time=state.time + 1.0, prediction=prediction)
 
     def update(self, state: UnknownInputEstimate, reception: Reception) -> UnknownInputEstimate:
         """Update the nodes with the measurements that arrive, and fuse.
@@ -255,14 +253,9 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
         Source: unknown_input, equations (8), (24), (25).
         """
         prediction, arrived = sensed(state.prediction), reception.arrived
-        xp = namespace(arrived)
-        held = xp.where(arrived[:, None], state.measurement, state.held)
-        return replace(
-            state,
-            held=held,
-            age=xp.where(arrived, 0.0, state.age),
-            estimates=self.nodes.update(state.estimates, prediction, held, arrived, state.time),
-        )
+        after = state.after(arrived)
+        estimates = self.nodes.update(state.estimates, prediction, after.held, arrived, state.time)
+        return replace(after, estimates=estimates)
 
     def read(self, state: UnknownInputEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""

@@ -1,7 +1,7 @@
-"""Linear minimum-variance filter of a centre that receives measurements.
+"""Filters of a centre that receives measurements: the best linear one, and interacting models.
 
-It shares with the interacting models the beliefs about state and noise, their update with any of
-the measurements, and the prediction of measurements.
+They share the beliefs about state and noise, their update with any of the measurements, and the
+prediction of measurements.
 
 Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
 systems with correlated noises and fading measurements), for all sensors at once.
@@ -9,6 +9,7 @@ systems with correlated noises and fading measurements), for all sensors at once
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -111,18 +112,59 @@ def mode_mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
     return mean, linalg.total(belief.probability[:, None, None] * spreads, 0)
 
 
-def predict_jointly(belief: Belief, maps: Array, variance: Array) -> ModePrediction:
-    """Return the prediction with ``maps`` (M, n + l, s, 1) and noise ``variance`` (M, l, N)."""
-    mean, covariance = mode_mixture(belief, maps)
-    own, sensors = linalg.total(belief.probability[:, None] * variance, 0), variance.shape[1]
-    for sensor in range(sensors):
-        place = len(mean) - sensors + sensor
-        covariance = update_at(np.add, covariance, (..., place, place, _ALL), own[sensor])
-    return ModePrediction(mean, covariance)
+@dataclass(frozen=True)
+class CentralFilter(ABC):
+    """A filter at the centre, with one normal distribution of z for each of M models.
+
+    ``maps`` (M, n + l, s, 1) from z to col(x, y), with y without its independent noise · ``motion``
+    from z to the next state of a model.
+    """
+
+    model: AugmentedModel
+    maps: Array
+    motion: Array
+
+    @abstractmethod
+    def start(self, runs: int) -> Belief:
+        """Return the belief of time 0, without measurements."""
+
+    @abstractmethod
+    def predict(self, belief: Belief, time: Times) -> Belief:
+        """Return the prediction for ``time`` + 1 from the belief after ``time`` (N,)."""
+
+    @abstractmethod
+    def _variance(self, belief: Belief, time: Times) -> Array:
+        """Return variances (M, l, N) of the measurements' independent noises at ``time`` (N,)."""
+
+    def prediction(self, belief: Belief, time: Times) -> ModePrediction:
+        """Return the prediction of plant and measurements for ``time`` (N,)."""
+        variance = self._variance(belief, time)
+        mean, covariance = mode_mixture(belief, self.maps)
+        own, sensors = linalg.total(belief.probability[:, None] * variance, 0), variance.shape[1]
+        for sensor in range(sensors):
+            place = len(mean) - sensors + sensor
+            covariance = update_at(np.add, covariance, (..., place, place, _ALL), own[sensor])
+        return ModePrediction(mean, covariance)
+
+    def update(
+        self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
+    ) -> Belief:
+        """Return the belief after the ``taken`` (l, N) of the measurements (l, N)."""
+        rows, variance = self.maps[:, self.model.plant.size :], self._variance(belief, time)
+        after, likelihood = condition_on(belief, rows, variance, measurement, taken)
+        # The likeliest possible model has weight one, so that far tails do not make 0 / 0.
+        xp = namespace(likelihood)
+        possible = xp.where(belief.probability > 0.0, likelihood, -np.inf)
+        weights = belief.probability * xp.exp(possible - possible.max(0))
+        return after._replace(probability=weights / linalg.total(weights))
+
+    def estimate(self, belief: Belief) -> tuple[Array, Array]:
+        """Return mean (n, N) and covariance (n, n, N) of the plant's state, over all models."""
+        return mode_mixture(belief, self.maps[:, : self.model.plant.size])
 
 
 @dataclass(frozen=True)
-class CentralisedLinearFilter:
+class CentralisedLinearFilter(CentralFilter):
     r"""Best linear filter at the centre, of all delivered measurements.
 
     The state of the belief is ζ = col(x 1{θ = m}), and the belief has one model. Covariances depend
@@ -160,9 +202,6 @@ class CentralisedLinearFilter:
     Source: markov_jump, equations (5)-(22), with the measurements of all sensors in one vector.
     """
 
-    model: AugmentedModel
-    maps: Array
-    motion: Array
     additional: Array
     variance: Array
 
@@ -221,23 +260,107 @@ class CentralisedLinearFilter:
         noise = self.model.plant.noise_covariance
         return with_noise(belief.probability, mean[None], covariance[None], noise)
 
-    def prediction(self, belief: Belief, time: Times) -> ModePrediction:
-        """Return the prediction of plant and measurements for ``time`` (N,)."""
-        return predict_jointly(belief, self.maps, self._variance(time))
-
-    def update(
-        self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
-    ) -> Belief:
-        """Return the belief after the ``taken`` (l, N) of the measurements (l, N)."""
-        rows = self.maps[:, self.model.plant.size :]
-        return condition_on(belief, rows, self._variance(time), measurement, taken)[0]
-
-    def estimate(self, belief: Belief) -> tuple[Array, Array]:
-        """Return mean (n, N) and covariance (n, n, N) of the plant's state."""
-        return mode_mixture(belief, self.maps[:, : self.model.plant.size])
-
-    def _variance(self, time: Times) -> Array:
+    def _variance(self, belief: Belief, time: Times) -> Array:
         return take(self.variance, self._at(time))[None]
 
     def _at(self, time: Times) -> Times:
         return namespace(time).minimum(time, self.variance.shape[-1] - 1)
+
+
+@dataclass(frozen=True)
+class InteractingModels(CentralFilter):
+    r"""Interacting multiple models at the centre: a Kalman filter and a probability for each mode.
+
+    Model j stands for θ(k) = j; its belief is about z = col(x, w). θ(k) governs both the
+    measurement at k and the move to k + 1. Beliefs are therefore predicted by the matrices of their
+    mode and mixed afterwards: p(θ(k+1) = m) = Σ_j p_jm p(θ(k) = j), and the belief of m has the
+    first two moments of that mixture. Given the mode, y_i = β̄_i H_ij x + α_i w plus independent
+    noise of variance R_i + σ_i² E(H_ij x)² under the prediction. Fading acts as noise of that
+    variance, so estimates and probabilities are approximate, and covariances depend on the data.
+
+    Shapes, s = n + r: ``maps`` (M, n + l, s, 1) from z to col(x, y), ``motion`` [Φ_j Γ_j]
+    (M, n, s, 1), ``unfaded`` H (M, l, n, 1).
+
+    Equation:
+        $$
+        \mu_j\leftarrow\frac{\mu_j\,\ell_j}{\sum_i\mu_i\,\ell_i},\qquad \mu_m(k+1)=\sum_j
+        p_{jm}\,\mu_j,\qquad \omega_{j|m}=\frac{p_{jm}\,\mu_j}{\mu_m(k+1)}
+        $$
+
+        $$
+        \hat x_m(k+1)=\sum_j\omega_{j|m}\,\hat x_j^{-},\qquad
+        P_m(k+1)=\sum_j\omega_{j|m}\left(P_j^{-}+(\hat x_j^{-}-\hat x_m)(\hat x_j^{-}-\hat
+        x_m)^{\mathsf T}\right)
+        $$
+
+        $$
+        \hat x=\sum_m\mu_m\hat x_m,\qquad P=\sum_m\mu_m\left(P_m+(\hat x_m-\hat x)(\hat x_m-\hat
+        x)^{\mathsf T}\right)
+        $$
+
+        μ are the probabilities of the modes, p the Markov chain, ℓⱼ the likelihood of the delivered
+        measurements under mode j. x̂ⱼ⁻, Pⱼ⁻ are the prediction of the Kalman filter of mode j, with
+        yᵢ = β̄ᵢ Hᵢⱼ x + αᵢ w plus a noise of variance Rᵢ + σᵢ² E(Hᵢⱼ x)².
+
+    Assumes: one Gaussian a mode after every step, and fading that acts as Gaussian noise.
+
+    Source: H. A. P. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for
+    systems with Markovian switching coefficients", IEEE Trans. Automatic Control 33, 1988; the
+    system is from markov_jump.
+    """
+
+    unfaded: Array
+
+    @classmethod
+    def create(cls, model: AugmentedModel) -> InteractingModels:
+        """Return the filter of a plant and its sensors."""
+        plant, sensors = model.plant, model.sensors
+        n, count = plant.size, sensors.count
+        unfaded = sensors.measurement_matrix.transpose(2, 0, 1)
+        maps = np.zeros((plant.modes, n + count, n + len(plant.noise_covariance)))
+        maps[:, :n, :n] = np.eye(n)
+        maps[:, n:, :n] = sensors.fading_mean[:, None] * unfaded
+        maps[:, n:, n:] = sensors.noise_coupling[..., 0]
+        motion = np.concatenate((plant.transition, plant.process_gain), axis=1)
+        return cls(
+            model=model,
+            maps=maps[..., None],
+            motion=np.ascontiguousarray(motion.transpose(2, 0, 1))[..., None],
+            unfaded=np.ascontiguousarray(unfaded)[..., None],
+        )
+
+    def start(self, runs: int) -> Belief:
+        """Return the belief of time 0: the plant's own distributions."""
+        plant, n = self.model.plant, self.model.plant.size
+        probability = np.broadcast_to(plant.initial_probabilities[:, None], (plant.modes, runs))
+        mean = np.broadcast_to(plant.initial_mean, (plant.modes, n, runs))
+        covariance = np.broadcast_to(plant.initial_covariance, (plant.modes, n, n, runs))
+        return with_noise(probability.copy(), mean, covariance, plant.noise_covariance)
+
+    def predict(self, belief: Belief, time: Times) -> Belief:
+        """Return the prediction for ``time`` + 1 from the belief after ``time`` (N,)."""
+        xp, chain = namespace(belief.mean), self.model.plant.mode_transition
+        moved = linalg.matvec(self.motion, belief.mean)
+        spread = linalg.congruence(self.motion, belief.covariance)
+        beliefs = []
+        for later in range(self.model.plant.modes):
+            joint = chain[:, later, None] * belief.probability
+            own = linalg.total(joint)
+            possible = own > 0.0  # else any weights will do
+            weights = xp.where(possible, joint, 1.0 / self.model.plant.modes)
+            weights /= xp.where(possible, own, 1.0)
+            mixed = linalg.total(weights[:, None] * moved, 0)
+            apart = moved - mixed
+            second = weights[:, None, None] * (spread + linalg.outer(apart, apart))
+            beliefs.append((own, mixed, linalg.total(second, 0)))
+        probability, mean, covariance = map(xp.stack, zip(*beliefs, strict=True))
+        probability /= linalg.total(probability)
+        return with_noise(probability, mean, covariance, self.model.plant.noise_covariance)
+
+    def _variance(self, belief: Belief, time: Times) -> Array:
+        """Return variances (M, l, N) of the measurements' independent noises, including fading."""
+        n = self.model.plant.size
+        mean, covariance = belief.mean[:, :n], belief.covariance[:, :n, :n]
+        second = covariance + linalg.outer(mean, mean)
+        observed = linalg.quadratic(self.unfaded, second[:, None])
+        return self.model.sensors.fading_variance[:, None] * observed + self.model.sensors.variance
