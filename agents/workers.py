@@ -11,18 +11,15 @@ import functools
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import joblib
 
-from agents.cache import Cache
-from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden
 from fusion_gym.output.ending import name_user_code
-from fusion_gym.output.files import fingerprint
 from fusion_gym.output.progress import progress_bar
 from fusion_gym.validation import ConfigurationError
 
@@ -89,52 +86,25 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-class WorkPiece(Protocol):
-    """A piece of work: all inputs of its result, and its seconds on one core."""
-
-    @property
-    def inputs(self) -> Plain: ...  # noqa: D102
-    @property
-    def weight(self) -> float: ...  # noqa: D102
-
-
-def missing(
-    function: Callable[[Any], Any], pieces: Iterable[WorkPiece], cache: Cache
-) -> list[Call]:
-    """Return the calls that compute the missing results of these pieces, each once."""
-    every = {fingerprint(piece.inputs): piece for piece in pieces}
-    return [
-        Call(piece.weight, _fill, (cache, function, piece))
-        for piece in every.values()
-        if not cache.holds(function, piece.inputs)
-    ]
-
-
-def _fill(cache: Cache, function: Callable[[Any], Any], piece: WorkPiece) -> None:
-    cache.call(function, piece.inputs, piece)
-
-
 def run_parallel(work: Sequence[Call], pool: Pool, description: str) -> list[Any]:
     """Run the work in the pool with progress, and return the results in the work's order."""
     if not work:
         return []
-    results: list[Any] = [None] * len(work)
-    left = dict(enumerate(work))
+    results: dict[int, Any] = {}
     parent, total = os.getpid() if pool.local else None, sum(call.weight for call in work)
-    with progress_bar(len(work), description, unit="pieces") as bar, pool.connect():
+    with progress_bar(100.0, description, unit="%") as bar, pool.connect():
         pieces = pool.map_unordered(functools.partial(_do, parent), list(enumerate(work)))
         try:
             for place, result in pieces:
                 results[place] = result
-                del left[place]
-                rest = sum(call.weight for call in left.values())
-                bar.reach(len(work) - len(left), 1.0 - rest / total)
+                bar.say(f"{len(results)} of {len(work)} pieces")
+                bar.update(100.0 * work[place].weight / total)
         except BrokenProcessPool:
             raise ConfigurationError(
                 f"workers = {pool.workers}: the system ended one of them; the memory may be full. "
                 "Finished pieces of work are saved: continue as after an interrupt"
             ) from None
-    return results
+    return [results[place] for place in range(len(work))]
 
 
 def _do(parent: int | None, item: tuple[int, Call]) -> tuple[int, Any]:

@@ -6,7 +6,6 @@ Each YAML block of the page is a plant, whose name is also the folder of its com
 ``--resume`` skips finished commands and continues an interrupted training.
 """
 
-import argparse
 import json
 import os
 import re
@@ -14,8 +13,9 @@ import shlex
 import shutil
 import subprocess
 import time
-from dataclasses import asdict, dataclass
 from pathlib import Path
+
+import tyro
 
 from fusion_gym import __version__
 from fusion_gym.docstrings import table
@@ -25,41 +25,37 @@ PAGE = Path(__file__).parent.parent / "docs" / "newcomer.md"
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class Run:
-    """A command of the page: seconds of the wall and of the processor."""
+def main(resume: bool = False, folder: Path = Path("runs/newcomer")) -> None:
+    """Run missing commands, then write tables and figures.
 
-    command: str
-    seconds: float
-    processor: float
-
-
-def main() -> None:
-    """Run missing commands, then write tables and figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--resume", action="store_true", help="keep finished commands")
-    parser.add_argument("--folder", type=Path, default=Path("runs/newcomer"))
-    arguments = parser.parse_args()
-    if not arguments.resume:
-        shutil.rmtree(arguments.folder, ignore_errors=True)
-    arguments.folder.mkdir(parents=True, exist_ok=True)
+    Args:
+        resume: keep finished commands.
+        folder: of the commands.
+    """
+    if not resume:
+        shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True, exist_ok=True)
     text = PAGE.read_text(encoding="utf-8")
     plants = [block for language, block in FENCE.findall(text) if language == "yaml"]
     names = [re.match(r"# (\w+)\.yaml\n", block)[1] for block in plants]  # type: ignore[index]
     shell = "".join(block for language, block in FENCE.findall(text) if language == "bash")
     lines = [line for line in shell.replace("\\\n", " ").splitlines() if line[:10] == "fusion-gym"]
     for name, plant in zip(names, plants, strict=True):
-        (arguments.folder / f"{name}.yaml").write_text(plant, encoding="utf-8")
-    runs = [run(line, arguments.folder) for line in lines]
+        (folder / f"{name}.yaml").write_text(plant, encoding="utf-8")
+    runs = [run(line, folder) for line in lines]
     for name in names:
-        comparison = arguments.folder / "runs" / name / "comparison"
+        comparison = folder / "runs" / name / "comparison"
         text = replaced(text, name, points_table(comparison / "comparison.json"))
         shutil.copy(comparison / "pareto.png", PAGE.with_name(f"newcomer_{name}.png"))
-    PAGE.write_text(replaced(text, "seconds", seconds_table(runs)), encoding="utf-8")
+    seconds = table(("command", "seconds", "of the processor"), runs)
+    PAGE.write_text(replaced(text, "seconds", seconds), encoding="utf-8")
 
 
-def run(line: str, folder: Path) -> Run:
-    """Run a command in the folder, or read the time of an earlier run."""
+def run(line: str, folder: Path) -> tuple[str, str, str]:
+    """Return the row of a command: its seconds of the wall and of the processor.
+
+    An earlier run is read.
+    """
     words = shlex.split(line)
     stored = folder / f"{'_'.join(re.findall(r'[a-z]+', line))[:120]}.json"
     if not stored.exists():
@@ -73,9 +69,9 @@ def run(line: str, folder: Path) -> Run:
             raise RuntimeError(f"{line} ended with {ended.returncode}: {ended.stderr[-1000:]}")
         after = os.times()
         processor = after.children_user - before.children_user
-        result = Run(words[1], time.monotonic() - began, processor)
-        stored.write_text(json.dumps(asdict(result)))
-    return Run(**json.loads(stored.read_text()))
+        stored.write_text(json.dumps([words[1], time.monotonic() - began, processor]))
+    command, seconds, processor = json.loads(stored.read_text())
+    return f"`{command}`", f"{seconds:.0f}", f"{processor:.0f}"
 
 
 def points_table(path: Path) -> str:
@@ -92,12 +88,6 @@ def points_table(path: Path) -> str:
     return table(heads, rows) + f"\n\nMeasured in fusion-gym {__version__}."
 
 
-def seconds_table(runs: list[Run]) -> str:
-    """Return the table of each command's wall and processor seconds."""
-    rows = [(f"`{item.command}`", f"{item.seconds:.0f}", f"{item.processor:.0f}") for item in runs]
-    return table(("command", "seconds", "of the processor"), rows)
-
-
 def replaced(text: str, name: str, content: str) -> str:
     """Return the page with new content between the marks of this name."""
     pattern = re.compile(rf"(<!-- table: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -105,4 +95,4 @@ def replaced(text: str, name: str, content: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

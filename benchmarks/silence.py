@@ -7,7 +7,6 @@ rate on 150 episodes, and 1,000 other episodes measure it. ``tuned`` improves th
 sensor after another at the same rate. ``--resume`` keeps the plants in runs/silence.
 """
 
-import argparse
 import json
 from collections.abc import Callable
 from functools import partial
@@ -16,6 +15,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import tyro
 from rich.progress import track
 
 import fusion_gym
@@ -129,18 +129,19 @@ def measure(name: str, episodes: int) -> dict[str, list[Any]]:
     return results
 
 
-def main() -> None:
-    """Measure the plants, and write tables and picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--resume", action="store_true", help="keep measured plants")
-    parser.add_argument("--folder", type=Path, default=Path("runs/silence"))
-    arguments = parser.parse_args()
+def main(episodes: int = 1000, resume: bool = False, folder: Path = Path("runs/silence")) -> None:
+    """Measure the plants, and write tables and picture.
+
+    Args:
+        episodes: of each method and rate.
+        resume: keep measured plants.
+        folder: of measured plants.
+    """
     text, (figure, panels) = PAGE.read_text(encoding="utf-8"), plt.subplots(1, 3, figsize=(12, 4))
     for name, panel in zip(PLANTS, panels, strict=True):
-        path, rows = arguments.folder / f"{name}.json", []
-        if not (arguments.resume and path.exists()):
-            write(path, measure(name, arguments.episodes))
+        path, rows = folder / f"{name}.json", []
+        if not (resume and path.exists()):
+            write(path, measure(name, episodes))
         for label, results in json.loads(path.read_text()).items():
             rows.append((label, *(_cell(result) for result in results)))
             errors = [result["mse"]["mean"] for result in results]
@@ -166,4 +167,4 @@ def _cell(result: Any) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -7,10 +7,8 @@ the ratio to ``oscillator.c``, where a C compiler is at hand. ``--page`` writes 
 docs/speed.md.
 """
 
-import argparse
 import os
 import shutil
-import statistics
 import subprocess
 import tempfile
 import time
@@ -23,6 +21,7 @@ import filterpy.kalman
 import gymnasium
 import jax
 import numpy as np
+import tyro
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.progress import track
@@ -222,26 +221,25 @@ def _label(name: str, options: Options) -> str:
     return f"{name}, {given}" if given else name
 
 
-def main() -> None:
-    """Measure all rows and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=0.3, help="of each cell and turn")
-    parser.add_argument("--page", action="store_true", help="write docs/speed.md")
-    arguments = parser.parse_args()
+def main(seconds: float = 0.3, page: bool = False) -> None:
+    """Measure all rows and print the table.
+
+    Args:
+        seconds: of each cell and turn.
+        page: write docs/speed.md.
+    """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
     with tempfile.TemporaryDirectory() as folder:
         every = list(rows(folder))
         workloads = [workload for *_, by_runs in every for workload in by_runs.values()]
-        figures: list[list[float]] = [[] for _ in workloads]
         for workload in track(workloads, "first calls"):
             workload(1e-3)
-        for turn in range(TURNS):
-            for workload, speeds in track(
-                list(zip(workloads, figures, strict=True)), f"turn {turn + 1}"
-            ):
-                speeds.append(workload(arguments.seconds))
-    medians, lines, reference = map(statistics.median, figures), [], None
+        speeds = [
+            [workload(seconds) for workload in track(workloads, f"turn {turn + 1}")]
+            for turn in range(TURNS)
+        ]
+    medians, lines, reference = iter(np.median(speeds, axis=0)), [], None
     for label, kind, by_runs in every:
         median = {runs: next(medians) for runs in by_runs}
         reference = median[1024] if kind == "C loop" else reference
@@ -251,11 +249,11 @@ def main() -> None:
     counts = (f"{runs:,} runs" for runs in RUNS[1:])
     heads = "environment", "interface", "1 run", *counts, "1,024 to C"
     text = f"{table(heads, lines)}\n\nMeasured in fusion-gym {fusion_gym.__version__}."
-    if arguments.page:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(page, "throughput", text), encoding="utf-8")
+    if page:
+        content = replaced(PAGE.read_text(encoding="utf-8"), "throughput", text)
+        PAGE.write_text(content, encoding="utf-8")
     Console(width=150).print(Markdown(text))
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

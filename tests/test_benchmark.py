@@ -13,7 +13,7 @@ from command_runs import refusal, succeed
 from scipy import stats
 
 import fusion_gym
-from agents.benchmark import rules, settings, tables, verdict
+from agents.benchmark import evidence, rules, settings, verdict
 from agents.benchmark.report import draw_class, headline_text, mean_text
 from agents.benchmark.settings import CLASSES, knowledge_of, load_suite
 from agents.benchmark.verdict import cost_difference, discoveries, mean_difference
@@ -59,7 +59,7 @@ def test_from_prices_to_pages_and_zoo(
 ) -> None:
     printed = succeed("benchmark", small).out
     folder = tmp_path / "results"
-    policies = read_rows(folder, tables.TestRow)
+    policies = read_rows(folder, evidence.TestRow)
     for name in CLASSES:
         for kind, seeds in (("rule", 1), ("threshold", 1), ("agent", 2), ("learned", 2)):
             own = [row for row in policies if (row.name, row.kind) == (name, kind)]
@@ -70,13 +70,13 @@ def test_from_prices_to_pages_and_zoo(
                 assert row.cost == pytest.approx(row.error + row.price * row.tokens, rel=1e-4)
     for kind in ("optimum", "other", "other_learned"):
         assert {row.name for row in policies if row.kind == kind} == {"scheduler"}
-    means = read_rows(folder, tables.ClassRow)
-    points = read_rows(folder, tables.PointRow)
+    means = read_rows(folder, evidence.ClassRow)
+    points = read_rows(folder, evidence.PointRow)
     for mean in means:
         key = (mean.name, mean.kind)
         own_points = [point.difference for point in points if (point.name, point.kind) == key]
         assert mean.difference == pytest.approx(np.mean(own_points), abs=1e-4)
-    trainings = read_rows(folder, tables.TrainingRow)
+    trainings = read_rows(folder, evidence.TrainingRow)
     assert [row.algorithm for row in trainings] == ["counterfactual_ppo"] * 6 + ["ppo"] * 2
     for row in trainings:
         kind = "learned" if row.algorithm == "counterfactual_ppo" else "other_learned"
@@ -86,7 +86,7 @@ def test_from_prices_to_pages_and_zoo(
         assert row.learned == pytest.approx(ratios.mean() - 1.0, abs=1e-4)
         # Where the calibration takes the rule alone, both policies are the same.
         assert 0 <= row.rule_points <= np.isclose(ratios, 1.0, atol=1e-5).sum()
-    savings = {row.kind: row for row in read_rows(folder, tables.SavingRow)}
+    savings = {row.kind: row for row in read_rows(folder, evidence.SavingRow)}
     costs = {
         (kind, name): np.array([p.cost for p in policies if (p.kind, p.name) == (kind, name)])
         for kind in ("rule", "trigger")
@@ -95,7 +95,7 @@ def test_from_prices_to_pages_and_zoo(
     shares = [1.0 - costs["rule", name] / costs["trigger", name] for name in ("local", "scheduler")]
     assert savings["rule"].saving == pytest.approx(np.mean(shares), abs=1e-4)
     assert savings["rule"].classes == 2
-    cases = read_rows(folder, tables.CaseRow)
+    cases = read_rows(folder, evidence.CaseRow)
     assert [row.case for row in cases] == ["as assumed", "half the tokens"]
     assert cases[0].rule == 0.0
     page = (folder / "README.md").read_text()
@@ -103,7 +103,7 @@ def test_from_prices_to_pages_and_zoo(
     assert (folder / "remote_estimation.png").stat().st_size > 20_000
     assert "remote_estimation" in printed
     # Finished pieces are not done again.
-    monkeypatch.setattr("agents.workers._fill", pytest.fail)
+    monkeypatch.setattr("agents.benchmark.jobs.Call", pytest.fail)
     succeed("benchmark", small)
     assert (folder / "README.md").read_text() == page
     place = ["--work", str(tmp_path / "work"), "--zoo", str(tmp_path / "zoo"), "--workers", "1"]
@@ -169,16 +169,16 @@ def test_a_mean_over_classes_weighs_classes_and_not_seeds() -> None:
 
 
 def test_a_median_stands_beside_a_mean_that_an_outlier_moves() -> None:
-    assert mean_text(tables.ClassRow("a", "b", "c", 0.1, 0.05, 0.15, 0.01)) == (
+    assert mean_text(evidence.ClassRow("a", "b", "c", 0.1, 0.05, 0.15, 0.01)) == (
         "+10.0 ± 5.0 (median +1.0)"
     )
-    assert mean_text(tables.ClassRow("a", "b", "c", -0.1, -0.12, -0.08, -0.105)) == "−10.0 ± 2.0"
-    assert mean_text(tables.ClassRow("a", "b", "bound", -0.1, -0.1, -0.1, -0.1)) == "−10.0"
+    assert mean_text(evidence.ClassRow("a", "b", "c", -0.1, -0.12, -0.08, -0.105)) == "−10.0 ± 2.0"
+    assert mean_text(evidence.ClassRow("a", "b", "bound", -0.1, -0.1, -0.1, -0.1)) == "−10.0"
 
 
 def test_points_without_tokens_have_a_tick_and_no_line() -> None:
     rows = [
-        tables.TestRow("a", "local", "trigger", 0, 0.1, price, 1.0, error, tokens, 0.0, 0.0, "")
+        evidence.TestRow("a", "local", "trigger", 0, 0.1, price, 1.0, error, tokens, 0.0, 0.0, "")
         for price, error, tokens in ((0.1, 0.2, 2.0), (1.0, 0.5, 0.02), (9.0, 0.9, 0.0))
     ]
     _, panel = plt.subplots()

@@ -13,9 +13,9 @@ from markdown_it import MarkdownIt
 from page_blocks import LANGUAGES, blocks_of
 
 import fusion_gym
+from agents.benchmark.evidence import SavingRow
 from agents.benchmark.report import headline_text
 from agents.benchmark.settings import load_suite
-from agents.benchmark.tables import SavingRow
 from docs.tables import PART, TABLES, written
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of

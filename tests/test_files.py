@@ -89,7 +89,7 @@ def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
     for suffix in ("zip", "json"):
         source = Path(fusion_gym.zoo.__file__).with_name(f"{name}.{suffix}")
         shutil.copyfile(source, tmp_path / source.name)
-    monkeypatch.setattr(fusion_gym.zoo, "_folder", lambda: tmp_path)
+    monkeypatch.setattr(fusion_gym.zoo, "_FOLDER", tmp_path)
     card = fusion_gym.zoo.card(name)
     task = fusion_gym.make_task(card["env"], **card["options"])
     make_policy(f"zoo:{name}", task)

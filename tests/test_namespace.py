@@ -30,7 +30,7 @@ MODULES += tuple(
 MODULES += tuple(
     f"systems/unknown_input/{name}" for name in ("filters", "nodes", "plant", "system")
 )
-NOT_TRACED = ("censored_beyond", "create", "_fuse_sets", "draw", "_advance")
+NOT_TRACED = ("censored_beyond", "create", "draw", "_advance")
 RUNS = 5
 
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,14 +20,6 @@ from agents.benchmark.settings import (
     Setting,
     Suite,
     knowledge_of,
-)
-from agents.benchmark.tables import (
-    CaseRow,
-    ClassRow,
-    PointRow,
-    SavingRow,
-    TestRow,
-    TrainingRow,
 )
 from agents.benchmark.training import TrainingJob, TrainingResult, run_training
 from agents.benchmark.verdict import (
@@ -47,6 +40,87 @@ from fusion_gym.validation import ConfigurationError
 TestResults = tuple[TestResult, ...]
 REFERENCE = "rule"
 CALIBRATED = {"agent": "learned", "other": "other_learned"}  # by the kind of the agent alone
+
+
+class TestRow(NamedTuple):
+    """A policy at a price on the test episodes: means per step."""
+
+    setting: str
+    name: str  # of the class
+    kind: str  # rule, threshold, trigger, agent, learned, other, …, optimum, the user's policy
+    seed: int  # of the training
+    share: float  # of the tokens of ``always`` that the best single threshold spends there
+    price: float
+    cost: float
+    error: float = math.nan
+    tokens: float = math.nan
+    mse: float = math.nan
+    rate: float = math.nan
+    policy: str = ""
+
+
+class PointRow(NamedTuple):
+    """The cost of a kind of policy at a price, relative to the searched rule's, minus 1."""
+
+    setting: str
+    name: str
+    kind: str
+    share: float
+    price: float
+    difference: float
+    low: float
+    high: float
+    discovery: bool  # after Benjamini and Hochberg, over all points of the table
+
+
+class ClassRow(NamedTuple):
+    """The mean of these differences over a class's prices and seeds; the median over seeds."""
+
+    setting: str
+    name: str
+    kind: str
+    difference: float
+    low: float
+    high: float
+    median: float
+
+
+class SavingRow(NamedTuple):
+    """The share of the own trigger's cost that a kind saves: a mean over prices and classes."""
+
+    setting: str
+    kind: str
+    classes: int
+    saving: float
+    low: float
+    high: float
+
+
+class TrainingRow(NamedTuple):
+    """A training and its calibration: processor seconds, and costs over the rule's, minus 1."""
+
+    setting: str
+    name: str
+    kind: str
+    algorithm: str
+    seed: int
+    timesteps: int
+    seconds: float
+    calibration_seconds: float
+    rule_points: int  # prices at which the calibration takes the rule alone
+    agent: float
+    learned: float
+
+
+class CaseRow(NamedTuple):
+    """A perturbed case: the rule's cost over its nominal cost, the learned policy's over that."""
+
+    setting: str
+    case: str
+    rule: float
+    difference: float
+    low: float
+    high: float
 
 
 @dataclass
@@ -245,13 +319,10 @@ def policy_rows(suite: Suite, classes: Sequence[Evidence]) -> list[TestRow]:
         for share, o in zip(suite.shares, outcomes, strict=True)
     ]  # fmt: skip
     return rows + [
-        TestRow(
-            item.setting.name, item.name, "bound", 0, share, price, bound, math.nan, math.nan,
-            math.nan, math.nan, "",
-        )
+        TestRow(item.setting.name, item.name, "bound", 0, share, price, bound)
         for item in classes
         for share, price, bound in zip(suite.shares, item.prices, item.bounds, strict=False)
-    ]  # fmt: skip
+    ]
 
 
 def point_rows(suite: Suite, classes: Sequence[Evidence]) -> list[PointRow]:

@@ -11,9 +11,10 @@ import pydantic
 
 from agents.benchmark.settings import Setting
 from agents.cache import Cache
-from agents.workers import Pool, missing, run_parallel
+from agents.workers import Call, Pool, run_parallel
 from fusion_gym.entries import Plain
 from fusion_gym.evaluation.rule_search import ClassName
+from fusion_gym.output.files import fingerprint
 
 AnyJob = TypeVar("AnyJob", bound="Job")
 Result = TypeVar("Result")
@@ -57,5 +58,11 @@ class Runner:
         self, work: Callable[[AnyJob], Result], jobs: Sequence[AnyJob], title: str
     ) -> list[Result]:
         """Return the results of jobs in their order, from the folder or computed."""
-        run_parallel(missing(work, jobs, self.cache), self.pool, title)
+        every = {fingerprint(job.inputs): job for job in jobs}
+        calls = [
+            Call(job.weight, self.cache.call, (work, job.inputs, job))
+            for job in every.values()
+            if not self.cache.holds(work, job.inputs)
+        ]
+        run_parallel(calls, self.pool, title)
         return [self.cache.read(work, job.inputs) for job in jobs]

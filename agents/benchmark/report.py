@@ -9,15 +9,21 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
-from rich.table import Table
 
 from agents.benchmark.evidence import (
     CALIBRATED,
+    CaseRow,
+    ClassRow,
     Evidence,
+    PointRow,
+    SavingRow,
+    TestRow,
+    TrainingRow,
     case_rows,
     class_rows,
     point_rows,
@@ -26,20 +32,10 @@ from agents.benchmark.evidence import (
     training_rows,
 )
 from agents.benchmark.settings import CLASSES, Setting, Suite
-from agents.benchmark.tables import (
-    CaseRow,
-    ClassRow,
-    PointRow,
-    SavingRow,
-    TestRow,
-    TrainingRow,
-    write_rows,
-)
 from fusion_gym.arrays import Array
 from fusion_gym.docstrings import table
-from fusion_gym.output import tables
 from fusion_gym.output.figures import save_figure
-from fusion_gym.output.files import write_text
+from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.palette import READABLE
 from fusion_gym.version import __version__
 
@@ -95,7 +91,10 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
         case_rows([item for item in classes if item.name == "scheduler"]),
     )
     for name, rows in results._asdict().items():
-        write_rows(folder / f"{name}.csv", rows)
+        with replacing(folder / f"{name}.csv") as partial:
+            pd.DataFrame(rows).to_csv(
+                partial, index=False, float_format="%.6g", na_rep="nan", lineterminator="\n"
+            )
     titles = {setting.name: setting.title for setting in suite.settings}
     for name, title in titles.items():
         draw_setting([row for row in results.policies if row.setting == name], title, folder)
@@ -380,17 +379,10 @@ def draw_headline(results: Results, titles: dict[str, str], path: Path) -> None:
 
 def print_classes(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> None:
     """Print the mean differences to the searched rule, and the difference at each price."""
-    shares = sorted({point.share for point in points}, reverse=True)
-    heads = ("setting", "class", "kind", "all prices", *(f"{share:.0%}" for share in shares))
-    result = Table(*heads, title="cost over the searched rule's, %; negative: cheaper")
-    for row in rows:
-        own = {
-            p.share: p
-            for p in points
-            if (p.setting, p.name, p.kind) == (row.setting, row.name, row.kind)
-        }
-        result.add_row(
-            row.setting, row.name, row.kind, mean_text(row),
-            *(signed_percent(own[share].difference) if own else "–" for share in shares),
-        )  # fmt: skip
-    tables.console().print(result)
+    places = ["setting", "name", "kind"]
+    each = pd.DataFrame(points).pivot(index=places, columns="share", values="difference")
+    each = each[each.columns[::-1]].map(signed_percent).rename(columns="{:.0%}".format)
+    means = {(row.setting, row.name, row.kind): mean_text(row) for row in rows}
+    result = pd.Series(means, name="all prices").rename_axis(places).to_frame().join(each)
+    print("cost over the searched rule's, %; negative: cheaper")
+    print(result.fillna("–").to_string())

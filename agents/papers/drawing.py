@@ -33,14 +33,6 @@ def legend(
     figure.legend(handles, labels, loc=f"outside {place} center", ncols=ncols, **style)
 
 
-def legend_of(figure: Any, handles: Sequence[Any], columns: int, length: float = 1.6) -> None:
-    """Draw a legend of these handles above all axes."""
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=columns, handlelength=length,
-        columnspacing=1.2, handletextpad=0.5,
-    )  # fmt: skip
-
-
 def set_ticks(axis: Any, values: Sequence[float]) -> None:
     """Label a logarithmic vertical axis at these values only."""
     axis.set_yticks(values, [f"{value:g}" for value in values])

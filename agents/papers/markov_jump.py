@@ -6,13 +6,14 @@ systems with correlated noises and fading measurements), Section 6.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
-from agents.papers.drawing import legend_of, stack
+from agents.papers.drawing import legend, stack
 from agents.papers.markov_jump_covariances import covariances
 from agents.papers.numbers import Number, below, grid
 from agents.papers.paper import (
@@ -350,6 +351,7 @@ _LINES: tuple[tuple[str, Any], ...] = (
 )
 _TIME = "time k (steps of 0.5 s)"
 _LANE = 1.7
+_legend = partial(legend, columns=99, handlelength=1.8, columnspacing=1.2, handletextpad=0.5)
 
 
 def _draw_instants(figure: Any, data: Data) -> None:
@@ -382,10 +384,10 @@ def _draw_tracking(figure: Any, data: Data) -> None:
     truth = data["truth"]
     time = np.arange(1, len(truth) + 1)
     for state, axis in enumerate(axes):
-        handles = axis.plot(time, truth[:, state], color=TRUTH, lw=1.8, label="state")
-        handles += _curves(axis, data, data["means"][..., state])
+        axis.plot(time, truth[:, state], color=TRUTH, lw=1.8, label="state")
+        _curves(axis, data, data["means"][..., state])
         _title(axis, state, STATES[state])
-    legend_of(figure, handles, len(handles), 1.8)
+    _legend(figure, axes)
 
 
 def _draw_errors(figure: Any, data: Data) -> None:
@@ -393,18 +395,18 @@ def _draw_errors(figure: Any, data: Data) -> None:
     axes = stack(figure, len(STATES), _TIME)
     for state, axis in enumerate(axes):
         _curves(axis, data, data["few"][..., state], width=0.7, alpha=0.55)
-        handles = _curves(axis, data, data["every"][..., state], width=2.0)
+        _curves(axis, data, data["every"][..., state], width=2.0)
         axis.set_ylim(bottom=0.0)
         _title(axis, state, f"RMSE of {STATES[state]}")
-    legend_of(figure, handles, len(handles), 1.8)
+    _legend(figure, axes)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
-    (axis,) = stack(figure, 1, _TIME)
-    handles = _curves(axis, data, data["trace"][:, :_SHOWN], width=1.8)
+    (axis,) = axes = stack(figure, 1, _TIME)
+    _curves(axis, data, data["trace"][:, :_SHOWN], width=1.8)
     axis.set_ylabel("trace of $P_0$ (m² and m²/s²)")
     axis.set_ylim(bottom=0.0)
-    legend_of(figure, handles, len(handles), 1.8)
+    _legend(figure, axes)
 
 
 def _title(axis: Any, state: int, what: str) -> None:
@@ -412,17 +414,13 @@ def _title(axis: Any, state: int, what: str) -> None:
     axis.set_ylabel(f"{STATES[state]} ({UNITS[state]})")
 
 
-def _curves(axis: Any, data: Data, values: Array, width: float = 1.4, alpha: float = 1.0) -> Any:
-    """Draw a curve (H,) of each threshold or policy; return their handles."""
-    handles = []
+def _curves(axis: Any, data: Data, values: Array, width: float = 1.4, alpha: float = 1.0) -> None:
+    """Draw a curve (H,) of each threshold or policy, labelled if it is opaque."""
     time = np.arange(1, values.shape[1] + 1)
     for place, (label, curve) in enumerate(zip(data["labels"], values, strict=True)):
         colour, line = _LINES[place % len(_LINES)]
-        handles += axis.plot(
-            time, curve, color=colour, lw=width, ls=line if alpha == 1.0 else "-", alpha=alpha,
-            label=label,
-        )  # fmt: skip
-    return handles
+        shown = {"ls": line, "label": label} if alpha == 1.0 else {}
+        axis.plot(time, curve, color=colour, lw=width, alpha=alpha, **shown)
 
 
 PAPER = Paper(

@@ -1,13 +1,11 @@
 """The pages of a reproduction: Markdown and JSON of a paper, its pictures, and the overview."""
 
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import matplotlib.pyplot as plt
-from PIL import Image
 
 from agents.papers.numbers import below, cite, estimate, number_text, percent, verdict
 from agents.papers.paper import NAMES, Data, Paper, PaperFigure
@@ -119,30 +117,8 @@ def write_figure(figure: PaperFigure, data: Data, path: Path) -> None:
             for suffix in ("png", "svg"):
                 with replacing(path.with_name(f"{path.name}.{suffix}")) as partial:
                     drawing.savefig(partial, format=suffix, metadata=_UNDATED[suffix])
-                    _SMALLER[suffix](partial)
         finally:
             plt.close(drawing)
 
 
-def _fewer_colours(png: Path) -> None:
-    """Reduce the file to a fourth of its size by a palette.
-
-    Maximum coverage keeps a thin line's colour, unlike a median cut.
-    """
-    with Image.open(png) as picture:
-        full = picture.convert("RGB")
-        small = full.quantize(_SHADES, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    small.save(png, format="png", optimize=True)
-
-
-def _fewer_digits(svg: Path) -> None:
-    """Round paths to a hundredth of a point."""
-    text = svg.read_text(encoding="utf-8")
-    path = re.compile(r' d="[^"]*"')
-    short = path.sub(lambda value: re.sub(r"(\.\d\d)\d+", r"\1", value.group()), text)
-    svg.write_text(short, encoding="utf-8")
-
-
-_SHADES = 128
-_SMALLER = {"png": _fewer_colours, "svg": _fewer_digits}
 _UNDATED: dict[str, Plain] = {"png": {"Software": None}, "svg": {"Date": None}}

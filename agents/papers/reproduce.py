@@ -12,8 +12,6 @@ were made from the same inputs by the same code.
 """
 
 import itertools
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,18 +33,19 @@ from agents.papers.paper import (
     load_papers,
 )
 from agents.workers import Call, Pool, run_parallel
-from fusion_gym.commands.command_line import Command, SetOptions
+from fusion_gym.commands.command_line import Long, SetOptions
 from fusion_gym.commands.options import OUTPUT_FOLDER, Seed, whole
 from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.files import lock_folder
+from fusion_gym.output.progress import writing
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import integer
 
 
 @dataclass(frozen=True)
-class Reproduce(Command):
+class Reproduce(Long):
     """Reproduce the simulation sections of the five papers."""
 
     program = "python -m agents.papers"
@@ -89,7 +88,7 @@ class Reproduce(Command):
 
     def _reproduce_pages(self, papers: list[Paper], output: Path) -> None:
         with ended_like_by_ctrl_c(), lock_folder(self.work, "work"):
-            print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
+            writing(("simulations", self.work), ("pages", output))
             jobs = {
                 (paper.name, piece.name): self._job(piece, paper.settings({}))
                 for paper in papers
@@ -126,12 +125,6 @@ class Reproduce(Command):
         work = [Call(job.weight, job.simulate, (cache,)) for job in absent]
         run_parallel(work, Pool(self.workers), "reproducing")
         return [cache.read(*job.key) for job in jobs]
-
-    def interrupted(self) -> str:
-        """Return the message of an interruption, with the command that continues."""
-        words = [word for word in sys.argv[1:] if word != "--resume"]
-        command = f"{self.program} {shlex.join([*words, '--resume'])}"
-        return f"interrupted; continue with: {command}"
 
 
 def reproduce_figure(

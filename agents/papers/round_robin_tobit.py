@@ -430,20 +430,17 @@ def _draw_table(figure: Any, data: Data, name: str) -> None:
         ticks, label = _interval_names(rows), "uncensored interval"
     axes = figure.subplots(1, 3)
     axes[1].set_xlabel(label)
+    marks: Plain = {"markersize": 8, "markeredgewidth": 2, "capsize": 3}
     for state, axis in enumerate(axes):
         values = [row[state] for row in printed_rows]
-        marks: list[tuple[str, Any, Any, str, str]] = [("printed", values, None, palette.INK, "x")]
-        for (key, label), colour, marker in zip(
-            _FILTERS.items(), (palette.FUSED, palette.BLUE), "os", strict=True
+        axis.errorbar(places - 0.18, values, fmt="x", color=palette.INK, label="printed", **marks)
+        for (key, label), shift, colour, marker in zip(
+            _FILTERS.items(), (0.0, 0.18), (palette.FUSED, palette.BLUE), "os", strict=True
         ):
             mean, low, high = np.array([[row[key][e][state] for e in _ENDS] for row in rows]).T
-            marks.append((label, mean, np.stack([mean - low, high - mean]), colour, marker))
-        for shift, (label, mean, ends, colour, marker) in zip(
-            (-0.18, 0.0, 0.18), marks, strict=True
-        ):
             axis.errorbar(
-                places + shift, mean, yerr=ends, fmt=marker, color=colour,
-                markersize=8, markeredgewidth=2, label=label, capsize=3,
+                places + shift, mean, [mean - low, high - mean], fmt=marker, color=colour,
+                label=label, **marks,
             )  # fmt: skip
         axis.bar(
             places, [row["floor"][state] for row in rows], width=0.8, color=palette.GREY,

@@ -8,10 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.patches import Patch
 
 from agents.papers import tobit_token_bucket_runs as runs
-from agents.papers.drawing import legend_of, stack
+from agents.papers.drawing import legend, stack
 from agents.papers.numbers import below, grid
 from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from agents.papers.tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
@@ -262,21 +261,20 @@ def _summarise_bucket_readings(data: Data) -> Data:
 
 _CENSORED = "#e4e6ea"  # opaque, so that grid and palette leave it as it is
 _TIME = "time t (steps)"
+_legend = partial(legend, handlelength=1.6, columnspacing=1.2, handletextpad=0.5)
 
 
 def _draw_tokens(figure: Any, data: Data) -> None:
     level, requested, granted = (data[name] for name in ("level", "requested", "granted"))
     requested, granted = requested.astype(bool), granted.astype(bool)
     upper, lower = stack(figure, 2, _TIME, height_ratios=(2, 1))
-    upper.step(np.arange(len(level)), level, where="post", color=INK, lw=1.6)
-    least = upper.axhline(
-        data["needed"], color=MEASURED, lw=1.6, ls="--", label="needed for a grant"
-    )
+    upper.step(np.arange(len(level)), level, where="post", color=INK, lw=1.6, label="tokens")
+    upper.axhline(data["needed"], color=MEASURED, lw=1.6, ls="--", label="needed for a grant")
     upper.set_ylabel("tokens")
     upper.set_ylim(0.0, data["capacity"] + 1.0)
     time = np.arange(1, len(requested) + 1)
-    (sent,) = lower.plot([], [], "|", color=INK, ms=9, mew=1.8, label="event, sent")
-    (refused,) = lower.plot([], [], "x", color=INK, ms=5, mew=1.0, label="event, refused")
+    lower.plot([], [], "|", color=INK, ms=9, mew=1.8, label="event, sent")
+    lower.plot([], [], "x", color=INK, ms=5, mew=1.0, label="event, refused")
     for sensor in _NODES:
         for selection, mark, size, width in (
             (granted[:, sensor], "|", 9, 1.8),
@@ -290,8 +288,7 @@ def _draw_tokens(figure: Any, data: Data) -> None:
     lower.set_yticks(range(1, SENSORS + 1), _NODE_NAMES[::-1])
     lower.set_ylim(0.4, SENSORS + 0.6)
     lower.grid(axis="y", visible=False)
-    (line,) = upper.plot([], [], color=INK, lw=1.6, label="tokens")
-    legend_of(figure, [line, least, sent, refused], 4)
+    _legend(figure, (upper, lower), 4)
 
 
 def _draw_measurements(figure: Any, data: Data, component: int) -> None:
@@ -300,7 +297,7 @@ def _draw_measurements(figure: Any, data: Data, component: int) -> None:
     axes = stack(figure, SENSORS, _TIME, sharey=True)
     time = np.arange(1, len(measured) + 1)
     for sensor, axis in enumerate(axes):
-        (before,) = axis.plot(
+        axis.plot(
             time, measured[:, sensor], color="#8d929b", lw=1.1,
             label="before the protocol: censored measurement $y$",
         )  # fmt: skip
@@ -308,8 +305,8 @@ def _draw_measurements(figure: Any, data: Data, component: int) -> None:
         axis.set_ylabel(_NODE_NAMES[sensor])
     figure.supylabel(f"component {component + 1} of the measurement (no unit)", fontsize=11)
     label = "after: held by the filter, " + r"$\bar{y}$"
-    (after,) = axes[0].plot([], [], color=INK, lw=1.7, label=label)
-    legend_of(figure, [before, after], 1)
+    axes[0].plot([], [], color=INK, lw=1.7, label=label)
+    _legend(figure, axes, 1)
 
 
 def _draw_states(figure: Any, data: Data, sensor: int) -> None:
@@ -318,20 +315,17 @@ def _draw_states(figure: Any, data: Data, sensor: int) -> None:
     axes = stack(figure, truth.shape[1], _TIME)
     time = np.arange(1, len(truth) + 1)
     for state, axis in enumerate(axes):
-        handles = [
-            axis.plot(time, values[:, state], mark, color=colour, lw=width, ms=3, label=label)[0]
-            for values, mark, colour, width, label in (
-                (local, "o-", COLOURS[sensor], 1.0, f"estimate, node {sensor + 1}"),
-                (truth, "-", TRUTH, 1.4, "state"),
-                (fused, "-", FUSED, 1.4, "fused estimate"),
-            )
-        ]
+        for values, mark, colour, width, label in (
+            (local, "o-", COLOURS[sensor], 1.0, f"estimate, node {sensor + 1}"),
+            (truth, "-", TRUTH, 1.4, "state"),
+            (fused, "-", FUSED, 1.4, "fused estimate"),
+        ):
+            axis.plot(time, values[:, state], mark, color=colour, lw=width, ms=3, label=label)
         low, high = axis.get_ylim()
-        axis.axhspan(low, 0.0, color=_CENSORED, lw=0)
+        axis.axhspan(low, 0.0, color=_CENSORED, lw=0, label="censored")
         axis.set_ylim(low, high)
         axis.set_ylabel(f"$x_{state + 1}$ (no unit)")
-    handles.append(Patch(color=_CENSORED, lw=0, label="censored"))
-    legend_of(figure, handles, 4)
+    _legend(figure, axes, 4)
 
 
 def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
@@ -346,18 +340,16 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
             return np.log10(values[:, sensor] if values.ndim > 1 else values)
 
         time = np.arange(1, len(curve("fused_error")) + 1)
-        handles = [
-            axis.plot(time, curve(name), color=colour, lw=width, ls=line, label=label)[0]
-            for name, colour, width, line, label in (
-                ("local_trace", own, 2.4, "-", f"bound, node {sensor + 1}"),
-                ("local_error", own, 1.3, dashes, f"squared error, node {sensor + 1}"),
-                ("fused_trace", FUSED, 2.4, "-", "bound, fused"),
-                ("fused_error", FUSED, 1.3, dashes, "squared error, fused"),
-            )
-        ]
+        for name, colour, width, line, label in (
+            ("local_trace", own, 2.4, "-", f"bound, node {sensor + 1}"),
+            ("local_error", own, 1.3, dashes, f"squared error, node {sensor + 1}"),
+            ("fused_trace", FUSED, 2.4, "-", "bound, fused"),
+            ("fused_error", FUSED, 1.3, dashes, "squared error, fused"),
+        ):
+            axis.plot(time, curve(name), color=colour, lw=width, ls=line, label=label)
         axis.set_title(title, loc="left")
         axis.set_ylabel("lg (no unit)")
-    legend_of(figure, handles, 2)
+    _legend(figure, axes, 2)
 
 
 _SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)

@@ -129,20 +129,20 @@ class Terms(NamedTuple):
     @property
     def gain(self) -> Array:
         """Return K q by (37), without loss where ȳ/q is huge (Sherman and Morrison)."""
-        cross = self.first * self.prior @ _transposed(self.matrix)
+        cross = self.first * self.prior @ self.matrix.mT
         inverse = np.linalg.inv(self.matrix @ cross + self.noise)
         turned = inverse @ self.pinned[..., None]
         size = 1.0 + self.pinned[..., None, :] @ turned
-        return cross @ (inverse - turned / size @ _transposed(turned))
+        return cross @ (inverse - turned / size @ turned.mT)
 
     def bound(self, gain: Array) -> Array:
         """Return the trace of (30) for any K q."""
         keep = np.eye(self.prior.shape[-1]) - gain @ self.matrix
         pinned = gain @ self.pinned[..., None]
-        return _trace(
-            self.first * keep @ self.prior @ _transposed(keep)
-            + gain @ self.noise @ _transposed(gain)
-            + pinned @ _transposed(pinned)
+        return np.linalg.trace(
+            self.first * keep @ self.prior @ keep.mT
+            + gain @ self.noise @ gain.mT
+            + pinned @ pinned.mT
         )
 
     @property
@@ -166,7 +166,7 @@ def terms(task: Task, history: History) -> Terms:
     q = np.moveaxis(history.uncensored, -1, 2)
     mean = np.moveaxis(history.prior_mean, -1, 1)
     latent = (observed @ mean[:, None, ..., None])[..., 0]
-    moment = grow * observed @ prior @ _transposed(observed) + shift * _squared(latent)
+    moment = grow * observed @ prior @ observed.mT + shift * _squared(latent)
     bias = np.moveaxis(history.hazard, -1, 2) * sensors.deviation[:, None, :, 0]
     time = np.arange(1.0, horizon + 1.0)
     event = centre.filter.event_error.at(time).T[:, :, None, None]
@@ -235,13 +235,5 @@ def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
     return values[:, -1], along.std(-1, ddof=1) / np.sqrt(error.shape[-1])
 
 
-def _transposed(matrix: Array) -> Array:
-    return np.swapaxes(matrix, -2, -1)
-
-
 def _squared(vector: Array) -> Array:
     return vector[..., :, None] * vector[..., None, :]
-
-
-def _trace(matrix: Array) -> Array:
-    return np.trace(matrix, axis1=-2, axis2=-1)

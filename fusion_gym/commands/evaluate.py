@@ -7,7 +7,6 @@ Every policy runs on the same seeds, so all policies meet the same noise. The co
 JSON after each policy; with ``--resume`` it skips the policies that the JSON already contains.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
@@ -31,13 +30,14 @@ from fusion_gym.evaluation.metrics import (
     summarise,
 )
 from fusion_gym.output import tables
-from fusion_gym.output.files import read_json, write
+from fusion_gym.output.files import check_inputs, read_json, write
 from fusion_gym.output.progress import progress_bar, remark, writing
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.checked import checked
 from fusion_gym.validation import ConfigurationError, refusal
 
+_INPUTS = "env", "episodes", "seed", "horizon", "settings"
 _DRAWN = 100  # episodes of the comparison of drawn with likeliest actions
 
 
@@ -185,12 +185,7 @@ def finished(path: Path | None, report: Plain) -> Plain:
     if not path.exists():
         return {"policies": {}}
     earlier = read_json(path, "json")
-    plain = json.loads(json.dumps(report))
-    for key in ("env", "episodes", "seed", "horizon", "settings"):
-        if earlier.get(key) != plain[key]:
-            raise ConfigurationError(
-                f"json {str(path)!r} holds another evaluation: its {key} is {earlier.get(key)!r}, "
-                f"requested is {plain[key]!r}"
-            )
+    now, then = ({key: item.get(key) for key in _INPUTS} for item in (report, earlier))
+    check_inputs(now, then, f"json {str(path)!r}")
     checked(Evaluation, earlier, f"json = {str(path)!r}")
     return earlier

@@ -60,7 +60,9 @@ class Watch(EnvironmentOptions, Long):
         policies = {name: make_policy(name, task) for name in names}
         frames = watch(task, policies, self.seed, self.steps)
         if self.save is None:
-            self._show(frames, " against ".join(names))
+            with contextlib.closing(Window(" against ".join(names), self.fps)) as window:
+                for frame in frames:
+                    window.show(frame)
         else:
             writing(("the film", self.save))
             save_film(self._counted(frames, task), self.save, self.fps)
@@ -75,14 +77,6 @@ class Watch(EnvironmentOptions, Long):
             for frame in frames:
                 yield frame
                 bar.update()
-
-    def _show(self, frames: Iterator[Frame], title: str) -> None:
-        window = Window(title, self.fps)
-        try:
-            for frame in frames:
-                window.show(frame)
-        finally:
-            window.close()
 
 
 def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:

@@ -88,14 +88,12 @@ class Film:
         first = max(age - self._window, 0)
         self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
         self._draw_states(times, steps, run, self.limits(run) if limits is None else limits)
-        granted: list[tuple[int, int]] = []
-        denied: list[tuple[int, int]] = []
-        for time, step in zip(times, steps, strict=True):
-            for sensor in np.flatnonzero(step.outcome.requested[:, run]):
-                answer = granted if step.outcome.granted[sensor, run] else denied
-                answer.append((int(time), int(sensor)))
-        for mark, points in zip(self._marks, (granted, denied), strict=True):
-            mark.set_data(*(np.array(points).T if points else ([], [])))
+        pairs = [(s.outcome.requested[:, run], s.outcome.granted[:, run]) for s in steps]
+        answers = np.array(pairs, dtype=np.bool_).reshape(-1, 2, self.task.sensors)
+        requested, granted = answers.swapaxes(0, 1)
+        for mark, drawn in zip(self._marks, (granted, ~granted), strict=True):
+            places, sensors = np.nonzero(requested & drawn)
+            mark.set_data(times[places], sensors)
         if self._level is not None:
             self._level.set_data(times, [step.tokens[run] for step in steps])
         self._axes[-1].set_xlim(first, first + self._window + 1)
@@ -191,8 +189,8 @@ class Film:
             axis.spines[["top", "right"]].set_visible(False)
         handles: dict[str, Any] = {}
         for axis in self._axes:
-            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-                handles.setdefault(label, handle)
+            drawn, labels = axis.get_legend_handles_labels()
+            handles = dict(zip(labels, drawn, strict=True)) | handles
         self._figure.legend(
             list(handles.values()), list(handles), loc="upper left", ncols=len(handles),
             bbox_to_anchor=(0.09, 1.0 - 37 / height), fontsize=7, frameon=False, borderaxespad=0.0,

@@ -7,7 +7,7 @@ import numpy as np
 
 from fusion_gym.core.scale import lower_hull
 from fusion_gym.evaluation.episodes import EpisodeResults
-from fusion_gym.evaluation.metrics import Interval, mean_interval
+from fusion_gym.evaluation.metrics import Interval, check_pair, mean_interval
 from fusion_gym.validation import ConfigurationError
 
 FAR_APART = 1.5
@@ -191,7 +191,5 @@ def compare_at_price(
 def _check_pairs(results: EpisodeResults, baselines: Mapping[str, EpisodeResults]) -> None:
     if not baselines:
         raise ConfigurationError("policies = {} is not allowed: at least one baseline is needed")
-    if any(item.episodes != results.episodes for item in baselines.values()):
-        raise ConfigurationError(
-            "episodes differ between policy and baselines: they must be paired"
-        )
+    for item in baselines.values():
+        check_pair(results, item)

@@ -198,9 +198,14 @@ def paired_difference(results: EpisodeResults, reference: EpisodeResults) -> Int
         >>> round(paired_difference(always, never).mean, 3)
         -0.07
     """
+    check_pair(results, reference)
+    return mean_interval(results.mse - reference.mse)
+
+
+def check_pair(results: EpisodeResults, reference: EpisodeResults) -> None:
+    """Check that two policies have the same number of episodes."""
     if results.episodes != reference.episodes:
         raise ConfigurationError(
             f"episodes = {results.episodes} and {reference.episodes} cannot be paired: both "
             "policies must run on the same seeds"
         )
-    return mean_interval(results.mse - reference.mse)

@@ -221,35 +221,22 @@ class MatrixWeightedFusion(FusionRule):
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
-        """Return the fused active estimates.
+        """Return the fused estimates.
 
         Args:
             means: (l, n, N).
             covariance: Joint covariance (l, l, n, n, N) of all errors, positive semi-definite.
-            active: (l, N) bool; all by default.
+            active: None: the rule joins all estimates, never some of them.
             basis: Ignored, because the weights do not depend on it.
         """
         if active is not None:
-            return self._fuse_sets(means, covariance, active)
+            raise ValueError("active is not allowed with the rule 'matrix': it joins all estimates")
         count, n, runs = means.shape
         weights = self.weights(covariance)
         row = weights.swapaxes(0, 1).reshape(n, count * n, runs)
         sigma = covariance.swapaxes(1, 2).reshape(count * n, count * n, runs)
         mean = linalg.matvec(row, means.reshape(count * n, runs))
         return Fused(mean, linalg.congruence(row, sigma), lambda: weights)
-
-    def _fuse_sets(self, means: Array, joint: Array, active: NDArray[np.bool_]) -> Fused:
-        """Return the fused estimates, one call of :meth:`fuse` per set of active estimates."""
-        mean, fused = np.full(means.shape[1:], np.nan), np.full(joint.shape[2:], np.nan)
-        gains = np.zeros(joint.shape[1:])
-        for selected in np.unique(active, axis=1).T:
-            nodes, lanes = np.flatnonzero(selected), np.flatnonzero((selected == active.T).all(1))
-            if nodes.size:
-                part = self.fuse(means[nodes][..., lanes], joint[np.ix_(nodes, nodes)][..., lanes])
-                mean[:, lanes], fused[..., lanes] = part.mean, part.covariance
-                for node, gain in zip(nodes, part.gains, strict=True):
-                    gains[node][..., lanes] = gain
-        return Fused(mean, fused, lambda: gains)
 
 
 def _solve_definite(spread: Array, ridge: Array, toward: Array) -> tuple[Array]:

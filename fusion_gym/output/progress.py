@@ -9,97 +9,79 @@ line at intervals, without control characters; a closed stderr receives nothing.
 """
 
 import contextlib
-import os
 import sys
 import time
 from collections.abc import Iterator
 from contextvars import ContextVar
+from datetime import timedelta
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task
-from rich.progress_bar import ProgressBar
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Column
 from rich.text import Text
 
+_CONSOLE = Console(stderr=True, force_jupyter=False)
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
+_DRAWN: ContextVar[Progress | None] = ContextVar("drawn", default=None)
 # Seconds between two lines, at most, and their share of the elapsed time.
 _EVERY, _MOST, _SHARE = 20.0, 600.0, 0.1
 
 
+class _Clock(ProgressColumn):
+    """Time since the start or resumption, and what remains at the mean speed so far."""
+
+    def render(self, task: Task) -> Text:
+        elapsed, gained = task.elapsed or 0.0, task.completed - task.fields["initial"]
+        text, left = _time(elapsed), "?"
+        if gained > 0.0:
+            reached = task.fields["reached"]
+            needed = reached * (task.remaining or 0.0) / gained
+            left = _time(max(needed - (elapsed - reached), 0.0))
+        return Text(text if task.finished else f"{text}, {left} left", "progress.remaining")
+
+
+_COUNT = TextColumn(
+    "{task.completed:,.0f}/{task.total:,.0f} {task.fields[unit]}", "progress.download", markup=False
+)
+_CLOCK = _Clock(Column(no_wrap=True))
+_COLUMNS = (
+    TextColumn("{task.description}", markup=False),
+    BarColumn(20),
+    _COUNT,
+    _CLOCK,
+    TextColumn("{task.fields[note]}", markup=False, table_column=Column()),
+)
+
+
 class Bar:
-    """The progress of a piece of work: ``done`` of ``total`` in a ``unit``, given in the plural.
+    """The progress of a piece of work, in a task of rich; ``plain`` prints lines."""
 
-    ``share`` of the work, from 0 to 1, gives the remaining time; ``note`` describes the present
-    work.
-    """
-
-    def __init__(self, description: str, total: float, unit: str, initial: float = 0.0) -> None:
-        self.description, self.total, self.unit = description, total, unit
-        self.done, self.note, self.share = initial, "", initial / total if total else 1.0
-        self._began = self._reached = time.monotonic()
-        self._first, self._due = self.share, self._began + _EVERY
-        self._ended: float | None = None
-        self.plain = False  # whether lines are printed instead of a bar
+    def __init__(self, progress: Progress, task: Task, plain: bool) -> None:
+        self.task, self._progress, self.plain, self._due = task, progress, plain, _EVERY
 
     def update(self, amount: float = 1.0) -> None:
-        """Add an amount to ``done``."""
-        self.reach(self.done + amount)
+        """Add an amount to what is done."""
+        self.reach(self.task.completed + amount)
 
-    def reach(self, done: float, share: float | None = None) -> None:
-        """Set ``done``, and ``share`` if parts of the work differ in duration."""
-        self.done = min(max(done, self.done), self.total)
-        known = self.done / self.total if share is None and self.total else share or 0.0
-        if known > self.share:
-            self.share, self._reached = min(known, 1.0), time.monotonic()
-        now = time.monotonic()
-        if self.plain and now >= self._due:
-            self._due = now + min(max(_EVERY, _SHARE * self.seconds), _MOST)
+    def reach(self, done: float) -> None:
+        """Set what is done; it never decreases, nor exceeds the total."""
+        done = min(max(done, self.task.completed), self.task.total or 0.0)
+        elapsed = self.task.elapsed or 0.0
+        reached = elapsed if done > self.task.completed else self.task.fields["reached"]
+        self._progress.update(self.task.id, completed=done, reached=reached)
+        if self.plain and elapsed >= self._due:
+            self._due = elapsed + min(max(_EVERY, _SHARE * elapsed), _MOST)
             remark(self.line())
 
     def say(self, note: str) -> None:
-        """Set the note."""
-        self.note = note
-
-    @property
-    def begun(self) -> bool:
-        """Whether the work has advanced."""
-        return self.share > self._first
-
-    @property
-    def seconds(self) -> float:
-        """Seconds since the start or resumption of the work."""
-        return (self._ended or time.monotonic()) - self._began
-
-    @property
-    def left(self) -> float | None:
-        """Seconds that remain at the mean speed so far; None before the work has advanced."""
-        if not self.begun:
-            return 0.0 if self.share >= 1.0 else None
-        needed = (self._reached - self._began) * (1.0 - self.share) / (self.share - self._first)
-        return max(needed - (time.monotonic() - self._reached), 0.0)
-
-    @property
-    def count(self) -> str:
-        """``done`` and ``total``, as text."""
-        return f"{int(self.done):,}/{int(self.total):,} {self.unit}"
-
-    @property
-    def clock(self) -> str:
-        """The elapsed and the remaining time, as text."""
-        if self.share >= 1.0:
-            return _time(self.seconds)
-        left = "?" if self.left is None else _time(self.left)
-        return f"{_time(self.seconds)}, {left} left"
-
-    def end(self) -> None:
-        """Stop the clock."""
-        self._ended, self.plain = time.monotonic(), False
+        """Describe the present work."""
+        self._progress.update(self.task.id, note=note)
 
     def line(self) -> str:
         """Return the progress in one line."""
-        message = [f"{self.description}: {int(100 * self.share)} %", self.count, self.clock]
-        return ", ".join([*message, self.note] if self.note else message)
+        line = f"{self.task.description}: {_COUNT.render(self.task)}, {_CLOCK.render(self.task)}"
+        return f"{line}, {note}" if (note := self.task.fields["note"]) else line
 
 
 @contextlib.contextmanager
@@ -107,16 +89,26 @@ def progress_bar(
     total: float, description: str, initial: float = 0.0, quiet: bool = False, unit: str = "steps"
 ) -> Iterator[Bar]:
     """Show a bar inside the context, below the bars of outer contexts."""
-    bar = Bar(description, total, unit, initial)
     silent = quiet or is_quiet()
-    drawn = not silent and (_SCREEN.progress is not None or _watched())
-    bar.plain = plain = not (silent or drawn)
-    with _SCREEN.showing(bar) if drawn else contextlib.nullcontext():
+    drawn = not silent and sys.stderr.isatty() and not _CONSOLE.is_dumb_terminal
+    outer = _DRAWN.get() if drawn else None
+    progress = outer or Progress(
+        *_COLUMNS, console=_CONSOLE, disable=not drawn, get_time=time.monotonic,
+        redirect_stdout=sys.stdout is not None and sys.stdout.isatty(),  # otherwise unchanged
+    )  # fmt: skip
+    task = progress.add_task(
+        description, total=total, unit=unit, initial=initial, reached=0.0, note=""
+    )
+    progress.update(task, completed=initial)
+    bar = Bar(progress, progress.tasks[-1], plain=not (silent or drawn))
+    token = _DRAWN.set(progress if drawn else _DRAWN.get())
+    with contextlib.nullcontext() if outer else progress:
         try:
             yield bar
         finally:
-            bar.end()
-            if plain and bar.begun:
+            _DRAWN.reset(token)
+            progress.stop_task(task)
+            if bar.plain and bar.task.completed > initial:
                 remark(bar.line())
 
 
@@ -137,12 +129,8 @@ def is_quiet() -> bool:
 
 def remark(text: str) -> None:
     """Print a line to stderr, above the bars."""
-    if is_quiet():
-        return
-    if _SCREEN.progress is not None:
-        _SCREEN.progress.console.print(Text(text), soft_wrap=True)
-    else:
-        print(text, file=sys.stderr, flush=True)
+    if not is_quiet():
+        _CONSOLE.print(Text(text), soft_wrap=True)
 
 
 def writing(*goods: tuple[str, Path | str]) -> None:
@@ -150,70 +138,5 @@ def writing(*goods: tuple[str, Path | str]) -> None:
     remark("writing " + ", ".join(f"{what} into {place}" for what, place in goods))
 
 
-class _Screen:
-    """The bars of a terminal, one below the other."""
-
-    def __init__(self) -> None:
-        self.progress: Progress | None = None
-
-    @contextlib.contextmanager
-    def showing(self, bar: Bar) -> Iterator[None]:
-        if self.progress is not None:
-            self.progress.add_task("", bar=bar)
-            yield
-            return
-        # Otherwise stdout is left unchanged.
-        watched = sys.stdout is not None and sys.stdout.isatty()
-        with Progress(*_columns(), console=Console(stderr=True), redirect_stdout=watched) as result:
-            self.progress = result
-            try:
-                result.add_task("", bar=bar)
-                yield
-            finally:
-                self.progress = None
-
-
-_SCREEN = _Screen()
-
-
-class _Part(ProgressColumn):
-    """A column with an attribute of a bar; columns that are not ``whole`` are shortened first."""
-
-    def __init__(self, name: str, style: str = "", whole: bool = True) -> None:
-        super().__init__(Column(no_wrap=whole))
-        self._name, self._style = name, style
-
-    def render(self, task: Task) -> Text:
-        text = getattr(task.fields["bar"], self._name)
-        return Text(text, self._style, no_wrap=True, overflow="ellipsis")
-
-
-class _Drawn(ProgressColumn):
-    """The column of the bar."""
-
-    def __init__(self) -> None:
-        super().__init__(Column(min_width=8, max_width=20))
-
-    def render(self, task: Task) -> ProgressBar:
-        return ProgressBar(1.0, task.fields["bar"].share)
-
-
-def _columns() -> list[ProgressColumn]:
-    return [
-        _Part("description"),
-        _Drawn(),
-        _Part("count", "progress.download"),
-        _Part("clock", "progress.remaining"),
-        _Part("note", whole=False),
-    ]
-
-
 def _time(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
-
-
-def _watched() -> bool:
-    """Return whether stderr is a terminal that can draw."""
-    return sys.stderr.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+    return str(timedelta(seconds=round(seconds)))

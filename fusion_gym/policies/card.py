@@ -88,7 +88,8 @@ class ModelView:
         card_entry = _entry(data)
         names, span = card_entry.get("observation_names"), card_entry.get("price_range")
         error = card_entry.get("nominal_error")
-        if names is not None and not _are_words(names):
+        listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        if names is not None and not listed:
             raise ConfigurationError("observation_names is not allowed: it must be a list of words")
         return cls(
             None if names is None else tuple(names),
@@ -218,7 +219,3 @@ def _table(data: Mapping[str, Any], key: str) -> Plain:
 
 def _errors(value: Any) -> tuple[float, ...]:
     return tuple(validation.not_negative("nominal_error", value, np.shape(value)).tolist())
-
-
-def _are_words(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(word, str) for word in value)

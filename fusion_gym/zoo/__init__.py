@@ -6,13 +6,13 @@ of ``NAME.zip``. ``zoo:NAME`` reads the plain parts and the weights of that file
 
 import hashlib
 import json
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden
 from fusion_gym.validation import choice
+
+_FOLDER = Path(__file__).parent
 
 
 def names() -> list[str]:
@@ -23,7 +23,7 @@ def names() -> list[str]:
         >>> zoo.names()[0]
         'biased_oscillator_centre'
     """
-    return sorted(Path(str(entry)).stem for entry in _folder().iterdir() if _is_model(entry))
+    return sorted(path.stem for path in _FOLDER.glob("*.zip"))
 
 
 def model_path(name: str) -> str:
@@ -41,7 +41,7 @@ def model_path(name: str) -> str:
         >>> Path(zoo.model_path("tobit_oscillator_local")).name
         'tobit_oscillator_local.zip'
     """
-    text, path = card(name)["sha256"], _folder().joinpath(f"{name}.zip")
+    text, path = card(name)["sha256"], _FOLDER / f"{name}.zip"
     value = hashlib.sha256(path.read_bytes()).hexdigest()
     if value != text:
         reason = f"{path} has the SHA-256 {value}, its card says {text}; reinstall fusion-gym"
@@ -63,14 +63,6 @@ def card(name: str) -> Plain:
         >>> zoo.card("tobit_oscillator_local")["env"]
         'fusion_gym/TobitOscillator-v1'
     """
-    path = _folder().joinpath(f"{choice('zoo', name, names())}.json")
+    path = _FOLDER / f"{choice('zoo', name, names())}.json"
     content: Plain = json.loads(path.read_text())
     return content
-
-
-def _folder() -> Any:
-    return resources.files(__name__)
-
-
-def _is_model(entry: Any) -> bool:
-    return str(entry.name).endswith(".zip")

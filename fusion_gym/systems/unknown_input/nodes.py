@@ -320,7 +320,7 @@ class TableNodes(_Nodes):
     ) -> tuple[Array, Array]:
         """Return the bound's trace (N,), weighted by (s,), and its reductions (l, N).
 
-        A reduction is that of one held difference that is zero.
+        A reduction supposes that one held difference is zero.
         """
         silent = linalg.weighted_trace(self.fused, weights)
         reduction = silent - linalg.weighted_trace(self.delivered, weights)
