@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+import warnings
 from dataclasses import fields
 from typing import Any
 
@@ -263,3 +264,12 @@ def test_the_zoo_the_evaluation_and_the_list_do_without_torch() -> None:
         "assert not {'torch', 'stable_baselines3', 'scipy.stats'} & sys.modules.keys()",
     )
     subprocess.run([sys.executable, "-c", "; ".join(lines)], check=True)
+
+
+def test_a_heavy_tail_is_warned_of() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.warns(UserWarning, match=r"1 % of 1000 samples have \d+ % .* heavy tail"):
+        mean_interval(np.exp(3.0 * rng.standard_normal(1000)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mean_interval(rng.exponential(size=1000))

@@ -226,9 +226,57 @@ def test_long_episodes_approach_the_average() -> None:
 
 def test_unstable_source_needs_a_reliable_channel() -> None:
     assert solve_average(SourceProblem.create(coefficient=1.2, price=5.0)).cost < 3.0
-    lossy = SourceProblem.create(coefficient=1.2, price=5.0, drop=0.9)
+    lossy = SourceProblem.create(coefficient=1.2, price=5.0, drop=0.8)
+    for solve in (solve_average, lambda p: JointProblem.create((p, p))):
+        with pytest.raises(ConfigurationError, match=r"coefficient = 1.2 .* is infinite"):
+            solve(lossy)
     with pytest.raises(ConfigurationError, match="iterations"):
-        solve_average(lossy, ErrorGrid.create(1.2, 1.0, 20.0, 0.2), iterations=20)
+        solve_average(SourceProblem.create(price=5.0), iterations=5)
+
+
+def error_of_always(a: float, drop: float) -> float:
+    """Mean squared error if every packet is sent: Σ (1-p) p^k (1 + a² + … + a^(2(k-1)))."""
+    grown = drop * a * a
+    return (1.0 - drop) / (a * a - 1.0) * (grown / (1.0 - grown) - drop / (1.0 - drop))
+
+
+@pytest.mark.parametrize("drop", [0.1, 0.5, 0.6, 0.65, 0.69])
+def test_losses_of_an_unstable_source_have_their_second_moment(drop: float) -> None:
+    free = SourceProblem.create(coefficient=1.2, price=0.0, drop=drop)
+    assert solve_average(free).cost == pytest.approx(error_of_always(1.2, drop), rel=1e-6)
+
+
+@pytest.mark.parametrize("drop", [0.5, 0.8])
+def test_an_episode_has_the_error_that_grows_beyond_the_grid(drop: float) -> None:
+    before, total = 1.0, 0.0
+    for _ in range(100):
+        total += drop * before
+        before = 1.44 * drop * before + 1.0
+    free = SourceProblem.create(coefficient=1.2, price=0.0, drop=drop)
+    assert solve_finite(free, 100).cost == pytest.approx(total, rel=1e-5)
+    priced = solve_finite(SourceProblem.create(coefficient=1.2, price=1.0, drop=drop), 100)
+    assert total <= priced.cost <= total + 100.0
+
+
+@settings(max_examples=50, deadline=None)
+@given(a=st.floats(0.5, 1.6), part=st.floats(0.0, 0.97), price=st.floats(0.1, 30.0))
+def test_a_wider_grid_has_the_same_optimum(a: float, part: float, price: float) -> None:
+    drop = part * min(0.95, 1.0 / a**2)
+    problem = SourceProblem.create(coefficient=a, price=price, drop=drop)
+    points = problem.grid().points
+    wide = solve_average(problem, ErrorGrid.create(a, 1.0, 1.5 * points[-1], points[1]))
+    solution = solve_average(problem)
+    assert solution.lower <= solution.cost <= solution.upper
+    assert solution.cost == pytest.approx(wide.cost, rel=1e-5)
+    assert solution.cost <= error_of_always(a, drop) + price if abs(a - 1.0) > 1e-3 else True
+
+
+def test_gilbert_elliott_of_an_unstable_source_agrees_with_a_wider_grid() -> None:
+    channel = {"drop": (0.7, 0.2), "transition": ((0.7, 0.3), (0.1, 0.9))}
+    problem = SourceProblem.create(coefficient=1.35, price=5.0, **channel)
+    points = problem.grid().points
+    wide = solve_average(problem, ErrorGrid.create(1.35, 1.0, 2.0 * points[-1], points[1]))
+    assert solve_average(problem).cost == pytest.approx(wide.cost, rel=1e-6)
 
 
 # --- several sources -----------------------------------------------------------------------------
@@ -241,6 +289,10 @@ def test_joint_optimum_of_sources_that_share_nothing_is_the_sum() -> None:
     episode = solve_joint_finite(JointProblem.create(sources), 50, (2.0, 0.0))
     parts = solve_finite(sources[0], 50, 2.0).cost + solve_finite(sources[1], 50).cost
     assert episode.cost == pytest.approx(parts, rel=2e-3)
+    lossy = SourceProblem.create(coefficient=1.2, price=2.0, drop=0.6)
+    pair = JointProblem.create((lossy, lossy))
+    both = 2.0 * solve_finite(lossy, 20, 1.0).cost
+    assert solve_joint_finite(pair, 20, (1.0, 1.0)).cost == pytest.approx(both, rel=2e-3)
 
 
 @pytest.mark.parametrize("drop", [0.0, 0.3])

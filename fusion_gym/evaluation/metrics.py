@@ -1,5 +1,6 @@
 """Metrics of episodes, and bootstrap confidence intervals over episodes."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -13,6 +14,7 @@ from fusion_gym.validation import ConfigurationError
 
 LEVEL = 0.95
 RESAMPLES = 2000
+_HEAVY = 0.2  # share of the largest samples from which on a mean has a heavy tail
 
 
 class Interval(NamedTuple):
@@ -37,7 +39,9 @@ class Interval(NamedTuple):
 def mean_interval(samples: Array, seed: int = 0) -> Interval:
     """Return the mean of samples with its 95 % percentile bootstrap interval.
 
-    A single sample, or equal samples, give the interval [mean, mean].
+    A single sample, or equal samples, give the interval [mean, mean]. A warning says that the
+    largest 1 % of the samples have more than a fifth of their sum: the tail is heavy, and the
+    interval may lie far below the expectation.
 
     Args:
         samples: one value per episode (E,).
@@ -55,6 +59,14 @@ def mean_interval(samples: Array, seed: int = 0) -> Interval:
     mean = float(np.mean(samples))
     if len(samples) < 2 or float(np.ptp(samples)) == 0.0:
         return Interval(mean, mean, mean)
+    sizes = np.sort(np.abs(samples))
+    share = sizes[len(sizes) - len(sizes) // 100 :].sum() / sizes.sum()
+    if share > _HEAVY:
+        warnings.warn(
+            f"the largest 1 % of {len(sizes)} samples have {100 * share:.0f} % of their sum: the "
+            "mean has a heavy tail, and its interval may miss the expectation",
+            stacklevel=2,
+        )
     from scipy import stats  # takes a third of a second
 
     low, high = stats.bootstrap(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,8 @@ class JointProblem:
         if len(sources) != 2:
             raise validation.refusal("sensors", len(sources), "2", "for the joint optimum")
         first, second = sources
+        for source in sources:
+            source.stationary_curvature()
         if len(first.drop) > 1 or len(second.drop) > 1:
             reason = "the channel must lose packets independently"
             raise forbidden("channel", "gilbert_elliott", reason, "for the joint optimum")
@@ -65,7 +68,10 @@ class JointProblem:
 
 
 class JointBellman:
-    """One step of backward induction; functions have the shape (M1, M2, K)."""
+    """One step of backward induction; functions have the shape (M1, M2, K).
+
+    Beyond the grids a value grows with each error's square as the ``curvature`` of its source says.
+    """
 
     def __init__(self, problem: JointProblem, grids: tuple[ErrorGrid, ErrorGrid]) -> None:
         self.problem, self.grids = problem, grids
@@ -75,12 +81,20 @@ class JointBellman:
         )
         self.error_cost = (first[:, None] + two)[..., None]
         self.shape = (len(first), len(two), len(problem.tokens.level))
+        self.curvature = [np.zeros((1, 1)) for _ in problem.sources]
+        self.squares = grids[0].points[:, None, None] ** 2, grids[1].points[:, None] ** 2
 
     def decide(self, value: Array) -> tuple[Array, NDArray[np.int8]]:
         """Return the least cost (M1, M2, K) and the best set of sources, as bits."""
         first, second = self.grids
+        parts = zip(self.problem.sources, self.curvature, self.squares, strict=True)
+        grown: Any = 0.0
+        for source, curvature, square in parts:
+            value = value - curvature * square
+            next_square = source.coefficient**2 * square + source.deviation**2
+            grown = grown + curvature * next_square
         ahead = (first.kernel @ value.reshape(self.shape[0], -1)).reshape(self.shape)
-        remains = self.error_cost + np.matmul(second.kernel, ahead)
+        remains = self.error_cost + np.matmul(second.kernel, ahead) + grown
         best = remains[..., self.problem.tokens.following[:, 0]]
         choice = np.zeros(self.shape, dtype=np.int8)
         for selected in (1, 2, 3):
@@ -115,6 +129,7 @@ class JointAverageSolution:
 def solve_joint_average(problem: JointProblem) -> JointAverageSolution:
     """Return the least average cost by relative value iteration, to a relative 1e-6."""
     bellman = JointBellman(problem, problem.grids())
+    bellman.curvature = [source.stationary_curvature() for source in problem.sources]
     lower, upper, choice = iterate_values(bellman.decide, bellman.shape, _TOLERANCE, _ITERATIONS)
     return JointAverageSolution(0.5 * (lower + upper), lower, upper, choice, bellman.grids)
 
@@ -141,7 +156,16 @@ def solve_joint_finite(
     choices = np.empty((steps, *bellman.shape), dtype=np.int8)
     for step in reversed(range(steps)):
         value, choices[step] = bellman.decide(value)
+        bellman.curvature = [
+            source.curvature(later)
+            for source, later in zip(problem.sources, bellman.curvature, strict=True)
+        ]
+    grown = 0.0
+    parts = zip(problem.sources, bellman.curvature, bellman.squares, initial_deviation, strict=True)
+    for source, curvature, square, spread in parts:
+        value = value - curvature * square
+        grown += float(curvature[0, 0]) * ((source.coefficient * spread) ** 2 + source.deviation**2)
     value = value[..., problem.tokens.initial]
     for source, grid, spread in zip(problem.sources, bellman.grids, initial_deviation, strict=True):
         value = source.first_law(grid, spread) @ value
-    return JointFiniteSolution(float(value), choices, bellman.grids)
+    return JointFiniteSolution(float(value) + grown, choices, bellman.grids)

@@ -53,15 +53,20 @@ class Bellman:
     """One step of backward induction; functions have the shape (M, S, K).
 
     The axes are the absolute error before the decision, the last channel state from the feedback,
-    and the token level.
+    and the token level. Beyond the grid a value grows with the error's square as its ``curvature``
+    (S, K) says, and otherwise stays: there the tokens alone decide when a request is best.
     """
 
     def __init__(self, problem: SourceProblem, grid: ErrorGrid, discount: float = 1.0) -> None:
         self.problem, self.grid, self.discount = problem, grid, discount
-        self.error_cost = problem.error_weight * grid.points[:, None, None] ** 2
+        self.square = grid.points[:, None, None] ** 2
+        self.error_cost = problem.error_weight * self.square
         self.shape = (len(grid.points), len(problem.drop), len(problem.tokens.level))
+        self.curvature = np.zeros(self.shape[1:])
 
-    def choices(self, value: Array, error_cost: Array | float, price: float) -> tuple[Array, Array]:
+    def choices(
+        self, value: Array, error_cost: Array | float, price: float, curvature: Array | float = 0.0
+    ) -> tuple[Array, Array]:
         """Return the costs (M, S, K) of silence and of a request.
 
         A request that the network would not grant has an infinite cost.
@@ -70,11 +75,14 @@ class Bellman:
             value: values of the next step (M, S, K).
             error_cost: cost of the remaining error, 0 at the error 0.
             price: cost of a request.
+            curvature: growth of these values (S, K) with the error's square.
         """
         problem = self.problem
         silence, sending = problem.tokens.following.T
-        remains = self.grid.kernel @ value.reshape(self.shape[0], -1)
-        remains = error_cost + self.discount * remains.reshape(self.shape)
+        flat = (value - curvature * self.square).reshape(self.shape[0], -1)
+        next_square = problem.coefficient**2 * self.square + problem.deviation**2
+        remains = (self.grid.kernel @ flat).reshape(self.shape) + curvature * next_square
+        remains = error_cost + self.discount * remains
         silent = _mix(problem.transition, remains[..., silence])
         later = remains[..., sending]
         request = _mix(problem.transition * problem.drop, later)
@@ -83,8 +91,20 @@ class Bellman:
 
     def decide(self, value: Array) -> tuple[Array, Array]:
         """Return the least cost (M, S, K), and the cost of silence minus the cost of a request."""
-        silent, request = self.choices(value, self.error_cost, self.problem.price)
+        silent, request = self.choices(value, self.error_cost, self.problem.price, self.curvature)
         return np.minimum(silent, request), silent - request
+
+    def mean(self, law: Array, deviation: float, value: Array) -> Array:
+        """Return the mean values (S,) of an error's ``law`` (M,), with the initial tokens.
+
+        Args:
+            law: probabilities of the grid's points.
+            deviation: the error's standard deviation.
+            value: values (M, S, K) with the present curvature.
+        """
+        flat = law @ (value - self.curvature * self.square)[..., self.problem.tokens.initial]
+        mean: Array = flat + self.curvature[:, self.problem.tokens.initial] * deviation**2
+        return mean
 
     def count(self, value: Array, threshold: Array) -> Array:
         """Return the expected transmissions (M, S, K) under thresholds.
@@ -170,6 +190,7 @@ def solve_average(
         ConfigurationError: no convergence, for example for an unstable source with frequent losses.
     """
     bellman = Bellman(problem, grid or problem.grid())
+    bellman.curvature = problem.stationary_curvature()
     lower, upper, advantage = iterate_values(bellman.decide, bellman.shape, tolerance, iterations)
     threshold, ordered = source_thresholds(advantage, bellman.grid.points)
     cost = 0.5 * (lower + upper)
@@ -219,6 +240,7 @@ def solve_discounted(
     """
     beta = validation.number("discount", discount, above=0.0, at_most=1.0 - 1e-6)
     bellman = Bellman(problem, grid or problem.grid(), beta)
+    bellman.curvature = problem.stationary_curvature(beta)
     value = np.zeros(bellman.shape)
     while True:
         new, advantage = bellman.decide(value)
@@ -227,7 +249,7 @@ def solve_discounted(
         value = new + beta / (1.0 - beta) * 0.5 * (change.min() + change.max())
         if np.ptp(change) <= tolerance * max(float(np.abs(new[0]).max()), 1e-300):
             break
-    first = bellman.grid.kernel[0] @ value[..., problem.tokens.initial]
+    first = bellman.mean(bellman.grid.kernel[0], problem.deviation, value)
     return DiscountedSolution(
         (1.0 - beta) * first, *source_thresholds(advantage, bellman.grid.points)
     )
@@ -275,11 +297,13 @@ def solve_finite(
     ordered = True
     for step in reversed(range(steps)):
         value, advantage = bellman.decide(value)
+        bellman.curvature = problem.curvature(bellman.curvature)
         values[step], here = source_thresholds(advantage, bellman.grid.points)
         sent = bellman.count(sent, values[step])
         ordered = ordered and here
     first = problem.first_law(bellman.grid, spread)
-    cost = float(first @ value[..., problem.tokens.initial] @ problem.initial)
+    deviation = float(np.hypot(problem.coefficient * spread, problem.deviation))
+    cost = float(bellman.mean(first, deviation, value) @ problem.initial)
     rate = float(first @ sent[..., problem.tokens.initial] @ problem.initial) / steps
     error = (cost / steps - problem.price * rate) / problem.error_weight
     return FiniteSolution(cost, error, rate, values, ordered)

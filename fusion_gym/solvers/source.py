@@ -145,6 +145,7 @@ class Resolution(NamedTuple):
     negligible: float
 
 
+_MOST_STEPS, _LARGEST, _PRECISION = 1_000_000, 1e12, 1e-13  # of the curvature
 _RESOLUTION = Resolution(finest=40.0, coarsest=5.0, points=600, negligible=1e-10)
 _RESOLUTION_TOKENS = _RESOLUTION._replace(points=300)  # where tokens are limited
 
@@ -226,21 +227,24 @@ class SourceProblem:
             wait: steps between two transmissions; by default those that the tokens can sustain.
             resolution: resolution of the default grid.
         """
+        curved = resolution is None
         if resolution is None:
             resolution = _RESOLUTION if len(self.tokens.level) == 1 else _RESOLUTION_TOKENS
         wait = max(1.0, self.tokens.wait) if wait is None else wait
-        reach = self._reach(wait, horizon, resolution.negligible)
+        reach = self._reach(wait, horizon, resolution.negligible, curved)
         finest, coarsest = (self.deviation / n for n in (resolution.finest, resolution.coarsest))
         step = min(max(reach / resolution.points, finest), coarsest)
         return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
 
-    def _reach(self, wait: float, horizon: int | None, negligible: float) -> float:
+    def _reach(self, wait: float, horizon: int | None, negligible: float, curved: bool) -> float:
         """Return an error that is exceeded with a ``negligible`` probability."""
         tails = -float(ndtri(0.5 * negligible))
         persistence = float(np.abs(np.linalg.eigvals(self.transition * self.drop)).max())
         losses = np.inf if persistence >= 1.0 else 0.0
         if 0.0 < persistence < 1.0:
             losses = np.log(negligible) / np.log(persistence)
+        if abs(self.coefficient) > 1.0 and curved:
+            losses = 0.0  # errors beyond the threshold grow as the curvature says
         steps = min((1.0 + losses) * wait + 1.0, np.inf if horizon is None else horizon, 4000.0)
         # The optimal threshold in continuous time for a = 1.
         scale = float((6.0 * self.price / self.error_weight) ** 0.25 * self.deviation**0.5)
@@ -258,6 +262,42 @@ class SourceProblem:
         with np.errstate(over="ignore"):
             growth = np.expm1(steps * np.log(max(square, 1e-300))) / (square - 1.0)
         return float(self.deviation * np.sqrt(growth))
+
+    def curvature(self, later: Array, discount: float = 1.0) -> Array:
+        """Return the growth (S, K) of a value with the error's square, for large errors.
+
+        Args:
+            later: growth (S, K) of the value one step later.
+            discount: factor of that value.
+        """
+        remains = self.error_weight + discount * self.coefficient**2 * later
+        silence, sending = self.tokens.following.T
+        lost = (self.transition * self.drop) @ remains[:, sending]
+        lost = np.where(self.tokens.affordable[:, 1], lost, np.inf)
+        result: Array = np.minimum(self.transition @ remains[:, silence], lost)
+        return result
+
+    def stationary_curvature(self, discount: float = 1.0) -> Array:
+        """Return the growth (S, K) without end.
+
+        Args:
+            discount: factor of the value one step later.
+
+        Raises:
+            ConfigurationError: it has no limit, so that the cost of every policy is infinite.
+        """
+        result = np.zeros((len(self.drop), len(self.tokens.level)))
+        for _ in range(_MOST_STEPS):
+            before, result = result, self.curvature(result, discount)
+            if not result.max() < _LARGEST:
+                break
+            if (result - before).max() <= _PRECISION * result.max():
+                return result
+        raise ConfigurationError(
+            f"coefficient = {self.coefficient:g} is not allowed with a loss probability of "
+            f"{validation.display(self.drop)}: losses, or waits for tokens, last so long that the "
+            "mean squared error of every policy is infinite"
+        )
 
     def first_law(self, grid: ErrorGrid, spread: float) -> Array:
         """Return the law (M,) of the first error on a grid, from the deviation of x(0)."""
