@@ -13,9 +13,12 @@ from fusion_gym.core.channel import Channel
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.network import Network
 from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.errors import ConfigurationError
+from fusion_gym.evaluation import run_episodes
 
 Array = NDArray[Any]
+Options = dict[str, Any]
 RUNS, STEPS = 5, 14
 DELAY = (0.5, 0.2, 0.3)
 FREE: dict[str, Any] = {"tokens": "unlimited", "access": "any"}
@@ -191,3 +194,89 @@ def test_an_episode_begins_without_packets_of_the_last_one() -> None:
         outcome, expected = batch.step(later), alone.step(later[:, 2:3])
         np.testing.assert_array_equal(outcome.error[:, 2:3], expected.error)
         np.testing.assert_array_equal(batch.observe()[2:3], alone.observe())
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize(
+    ("options", "drop"),
+    [
+        ({}, 0.0),
+        ({"channel": "independent", "drop_probability": 0.3}, 0.3),
+        ({"channel": "gilbert_elliott"}, 0.25 * 0.7 + 0.75 * 0.2),
+        ({"channel": "independent", "true_drop_probability": 0.6}, 0.6),
+        ({"channel": "independent", "true_drop_probability": (0.2, 0.6)}, 0.4),
+    ],
+)
+def test_every_environment_loses_its_packets(env_id: str, options: Options, drop: float) -> None:
+    task = fusion_gym.make_task(env_id, **options | FREE, horizon=40)
+    batch = EpisodeBatch.seeded(task, 200, 3)
+    sent, arrived = 0, 0
+    for _ in range(40):
+        outcome = batch.step(np.ones((task.sensors, 200), dtype=np.bool_))
+        assert not (outcome.arrived & ~outcome.granted).any()
+        sent, arrived = sent + outcome.granted.sum(), arrived + outcome.arrived.sum()
+    assert arrived / sent == pytest.approx(1.0 - drop, abs=0.035)
+    model = {"perfect": 1.0, "independent": 0.8}.get(task.settings["channel"])
+    if "drop_probability" not in options and model is not None:
+        assert (batch.signals()["arrival_probability"] == model).all()
+
+
+@pytest.mark.parametrize(("true", "spread"), [(0.4, 0.0), ((0.2, 0.6), 0.4 / np.sqrt(12.0))])
+def test_each_episode_draws_its_probability_of_a_loss(true: Any, spread: float) -> None:
+    lossy = {"channel": "independent", "true_drop_probability": true}
+    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", **lossy | FREE)
+    batch, arrived = EpisodeBatch.seeded(task, 400, 3), np.zeros(400)
+    for _ in range(100):
+        arrived += batch.step(np.ones((3, 400), dtype=np.bool_)).arrived.mean(0)
+    lost = 1.0 - arrived / 100.0
+    assert lost.mean() == pytest.approx(0.4, abs=0.03)
+    chance = 0.4 * 0.6 / 300.0
+    assert lost.std() == pytest.approx(np.sqrt(spread**2 + chance), rel=0.15)
+
+
+@pytest.mark.parametrize("drop", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize(
+    ("name", "options"), [("LinearFusion-v2", {}), ("TobitOscillator-v1", UNCENSORED)]
+)
+def test_filters_are_consistent_under_losses(name: str, options: Options, drop: float) -> None:
+    lossy = {"channel": "independent", "drop_probability": drop}
+    task = fusion_gym.make_task(f"fusion_gym/{name}", **options | lossy | FREE)
+    results = run_episodes(task, fusion_gym.make_policy("always", task), 500)
+    assert 0.95 < results.nees.mean() < 1.05
+    if name == "LinearFusion-v2" and drop == 0.3:
+        assert results.mse.mean() == pytest.approx(0.205, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"drop_probability": 0.2}, "drop_probability"),
+        ({"channel": "independent", "drop_probability": 1.2}, "drop_probability"),
+        ({"channel": "independent", "channel_transition": np.eye(2)}, "channel_transition"),
+        ({"channel": "gilbert_elliott", "true_drop_probability": 0.2}, "true_drop_probability"),
+        ({"channel": "independent", "true_drop_probability": (0.4, 0.2)}, "true_drop_probability"),
+        ({"channel": "noisy"}, "channel"),
+    ],
+)
+def test_what_a_channel_lacks_is_refused(options: Options, field: str) -> None:
+    with pytest.raises(ConfigurationError, match=rf"^{field} = "):
+        fusion_gym.make_task("fusion_gym/LinearFusion-v2", **options)
+
+
+def test_a_schedule_of_covariances_refuses_losses() -> None:
+    task = fusion_gym.make_task("fusion_gym/CorrelatedTracking-v1", channel="independent")
+    with pytest.raises(ConfigurationError, match="channel = 'independent' is not"):
+        fusion_gym.make_policy("periodic_optimum", task)
+
+
+def test_losses_under_jax_are_those_of_numpy() -> None:
+    lossy = FREE | {"channel": "independent", "true_drop_probability": (0.2, 0.6), "horizon": 20}
+    batches = [
+        EpisodeBatch.seeded(
+            fusion_gym.make_task("fusion_gym/LinearFusion-v2", backend=backend, **lossy), 4, 3
+        )
+        for backend in ("numpy", "jax")
+    ]
+    for _ in range(20):
+        numpy, compiled = (batch.step(np.ones((2, 4), dtype=np.bool_)).arrived for batch in batches)
+        np.testing.assert_array_equal(numpy, compiled)

@@ -28,6 +28,8 @@ class Channel:
         transition: (states, states), rows sum to 1.
         drop: Loss probabilities (states, sensors).
         initial: Distribution (states,) of S(0).
+        truth: Range (low, high) of the true probability of independent losses, of which each
+            episode draws; ``None`` is ``drop``.
 
     Source: Chakravorty and Mahajan, "Remote estimation over a packet-drop channel with Markovian
     state", IEEE Trans. Automatic Control 65, 2020, Section II.
@@ -36,6 +38,7 @@ class Channel:
     transition: Array
     drop: Array
     initial: Array
+    truth: tuple[float, float] | None = None
 
     @classmethod
     def perfect(cls, sensors: int) -> Channel:
@@ -43,10 +46,27 @@ class Channel:
         return cls(np.ones((1, 1)), np.zeros((1, sensors)), np.ones(1))
 
     @classmethod
-    def independent(cls, drop_probability: ArrayLike, sensors: int) -> Channel:
-        """Return a channel with independent losses, one probability or one per sensor."""
+    def independent(
+        cls, drop_probability: ArrayLike, sensors: int, truth: ArrayLike | None = None
+    ) -> Channel:
+        """Return a channel with independent losses.
+
+        Args:
+            drop_probability: One probability, or one per sensor.
+            sensors: Number of sensors.
+            truth: True probability, or a range (low, high) of which each episode draws.
+
+        Raises:
+            ConfigurationError: A probability is outside [0, 1].
+        """
         drop = _probabilities("drop_probability", drop_probability, (1, sensors))
-        return cls(np.ones((1, 1)), drop, np.ones(1))
+        if truth is None:
+            return cls(np.ones((1, 1)), drop, np.ones(1))
+        low, high = _probabilities("true_drop_probability", truth, (2,)).tolist()
+        if np.ndim(truth) > 0 and not low < high:
+            allowed = "a number from 0 to 1, or such a pair (low, high), low < high"
+            raise validation.refusal("true_drop_probability", truth, allowed)
+        return cls(np.ones((1, 1)), drop, np.ones(1), (low, high))
 
     @classmethod
     def gilbert_elliott(
@@ -91,7 +111,25 @@ class Channel:
     @property
     def loses(self) -> bool:
         """Whether a loss probability is positive."""
-        return bool(np.any(self.drop > 0.0))
+        return bool(np.any(self.drop > 0.0)) or self.truth is not None
+
+    @property
+    def start_channels(self) -> int:
+        """Number of standard normals of a start per sensor, and one for a drawn probability."""
+        drawn = self.truth is not None and self.truth[0] < self.truth[1]
+        return (self.drop.shape[1] if self.states > 1 else 0) + drawn
+
+    def begin(self, noise: Array) -> Array | None:
+        """Return the true probability (N,) of a loss; ``None`` is the model's.
+
+        Args:
+            noise: Standard normals (start_channels, N).
+        """
+        if self.truth is None:
+            return None
+        low, high = self.truth
+        uniform = ndtr(noise[-1]) if low < high else 0.0
+        return low + (high - low) * uniform + np.zeros(noise.shape[-1])
 
     def start(self, noise: Array) -> NDArray[np.int64]:
         """Return S(0), shape (sensors, N), from standard normals (sensors, N)."""
@@ -101,13 +139,18 @@ class Channel:
         """Return S(t), shape (sensors, N), from S(t-1) and standard normals (sensors, N)."""
         return _choose(namespace(state).asarray(self.transition.T)[:, state], noise)
 
-    def lost(self, state: NDArray[np.int64], noise: Array) -> NDArray[np.bool_]:
+    def lost(
+        self, state: NDArray[np.int64], noise: Array, truth: Array | None = None
+    ) -> NDArray[np.bool_]:
         """Return whether a packet sent in this state is lost, drawn for every sensor and step.
 
         Args:
             state: S(t), shape (sensors, N).
             noise: Standard normals (sensors, N), used whether or not a packet is sent.
+            truth: True probability (N,) of a loss; ``None`` is the model's.
         """
+        if truth is not None:
+            return ndtr(noise) < truth
         sensor = np.arange(len(state))[:, None]
         return ndtr(noise) < namespace(state).asarray(self.drop)[state, sensor]
 

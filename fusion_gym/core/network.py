@@ -25,8 +25,9 @@ class NetworkState:
     ``tokens`` (N,) · ``queue`` (l, N), the place of each sensor · ``admitted`` (l, N) bool, by the
     access rule · ``channel`` (l, N), the channels' state at the step before, which is fed back.
     Hidden are ``following`` (l, N), the channels' present state, ``lost`` (l, N) bool, whether a
-    packet sent now is lost, ``delay`` (l, N), its delay in steps, and ``due`` (D, l, N), the delay
-    of the packet that was sent 1, …, D steps ago, 0 without one. ``None`` is absent.
+    packet sent now is lost, ``delay`` (l, N), its delay in steps, ``due`` (D, l, N), the delay
+    of the packet that was sent 1, …, D steps ago, 0 without one, and ``true_drop`` (N,), the true
+    probability of a loss. ``None`` is absent.
     """
 
     tokens: Array
@@ -37,6 +38,7 @@ class NetworkState:
     lost: NDArray[np.bool_] | None = None
     delay: NDArray[np.int64] | None = None
     due: NDArray[np.int64] | None = None
+    true_drop: Array | None = None
 
 
 class Delivery(NamedTuple):
@@ -97,7 +99,7 @@ class Network:
     @property
     def start_channels(self) -> int:
         """Number of standard normals that :meth:`start` takes per run."""
-        return self.sensors * self._moves
+        return 0 if self.channel is None else self.channel.start_channels
 
     @property
     def draw_channels(self) -> int:
@@ -129,12 +131,21 @@ class Network:
             noise: Standard normals (start_channels, N).
         """
         runs, longest = noise.shape[-1], self._longest
-        channel = self.channel.start(noise) if self.channel is not None and self._moves else None
+        channel = true_drop = None
+        if self.channel is not None:
+            channel = self.channel.start(noise) if self._moves else None
+            true_drop = self.channel.begin(noise)
         due = np.zeros((longest, self.sensors, runs), dtype=np.int64) if longest else None
         everyone = np.ones((self.sensors, runs), dtype=np.bool_)
         bucket = self.bucket
         return NetworkState(
-            bucket.start(runs), bucket.start_queue(runs), everyone, channel, channel, due=due
+            bucket.start(runs),
+            bucket.start_queue(runs),
+            everyone,
+            channel,
+            channel,
+            due=due,
+            true_drop=true_drop,
         )
 
     def advance(self, state: NetworkState, noise: Array, step: NDArray[np.int64]) -> NetworkState:
@@ -150,8 +161,15 @@ class Network:
             lottery = noise[0] if self.access == "random" else None
             admitted = access_mask(self.access, self.sensors, step, lottery)
             noise = noise if lottery is None else noise[1:]
+        following = state.following
         moved = NetworkState(
-            state.tokens, state.queue, admitted, state.following, state.following, due=state.due
+            state.tokens,
+            state.queue,
+            admitted,
+            following,
+            following,
+            due=state.due,
+            true_drop=state.true_drop,
         )
         return self.draw(moved, noise) if len(noise) else moved
 
@@ -169,7 +187,7 @@ class Network:
         if self.channel is not None and self._loses:
             own = next(parts)
             present = np.zeros(own.shape, dtype=np.int64) if following is None else following
-            lost = self.channel.lost(present, own)
+            lost = self.channel.lost(present, own, state.true_drop)
         if self._longest:
             reached = np.cumsum(self.delay)[:-1, None, None]
             delay = (ndtr(next(parts)) >= reached).sum(0)
@@ -210,7 +228,15 @@ class Network:
             arrival = self.arrival_probability(state)
             failure = None if arrival is None else 1.0 - arrival
             reception = reception._replace(possible=possible, failure=failure)
-        moved = NetworkState(tokens, queue, state.admitted, state.channel, state.following, due=due)
+        moved = NetworkState(
+            tokens,
+            queue,
+            state.admitted,
+            state.channel,
+            state.following,
+            due=due,
+            true_drop=state.true_drop,
+        )
         return moved, Delivery(granted, spent, reception)
 
     def late(self, state: NetworkState) -> NDArray[np.bool_] | None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import declaration, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.channel import Channel
+from fusion_gym.core.channel import InitialState
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.noise import NoiseSource
 from fusion_gym.core.plant import Plant
@@ -31,7 +31,7 @@ Backend = Literal["numpy", "jax"]
 # Options that affect the scale of the reward, besides plant and sensors.
 _SCALING = (
     "access", "tokens", "token_rate", "token_capacity", "initial_tokens", "token_cost", "sharing",
-    "horizon",
+    "horizon", "channel", "drop_probability", "channel_transition", "initial_channel",
 )  # fmt: skip
 
 
@@ -81,6 +81,19 @@ class CommonOptions:
     sensors (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
     sensors while tokens last. ``"turns"`` grants in the order of a queue: a granted sensor goes to
     its end, and a head that the tokens do not pay for blocks the sensors behind it."""
+    channel: Literal["perfect", "independent", "gilbert_elliott"] = "perfect"
+    """Model of losses. ``"independent"`` loses every packet with one probability,
+    ``"gilbert_elliott"`` with a probability for each channel state. The network acknowledges what
+    arrives, and feeds the last channel states back."""
+    drop_probability: ArrayLike | None = None
+    """Probability of a loss. Independent: one number, or one per sensor, by default 0.2.
+    Gilbert-Elliott: the pair (bad, good), by default (0.7, 0.2)."""
+    channel_transition: ArrayLike | None = None
+    """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel.
+    By default ((0.7, 0.3), (0.1, 0.9))."""
+    initial_channel: InitialState = "stationary"
+    """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
+    law."""
     packet: Literal["measurement", "estimate"] = "measurement"
     """Content of a packet. ``"measurement"`` is the sensor's measurement or its node's estimate.
     ``"estimate"`` is the centralised scheduler's estimate with its covariance and needs
@@ -148,6 +161,10 @@ class CommonOptions:
     true_threshold_shift: ArrayLike = 0.0
     """Shift of the true censoring limits of the sensors. The filters assume 0. A pair (low, high)
     is a range from which each episode draws."""
+    true_drop_probability: ArrayLike | None = None
+    """True probability of a loss of independent channels. Estimators and policies assume
+    ``drop_probability``, the default. A pair (low, high) is a range from which each episode
+    draws."""
     true_transition: ArrayLike = 1.0
     """Factor c of the true motion, from x to x + c (f(x) - x). The filters assume f(x). A pair
     (low, high) is a range from which each episode draws."""
@@ -199,7 +216,6 @@ class Scenario:
         no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
         required_policy: The policy whose silence the filter reads, or ``None``.
         noise: Source of the plant's noise; ``None`` draws standard normals.
-        channel: Losses of the network; ``None`` loses nothing.
 
     Example:
         >>> import fusion_gym
@@ -221,7 +237,6 @@ class Scenario:
     no_estimates: str | None = None
     required_policy: str | None = None
     noise: NoiseSource | None = None
-    channel: Channel | None = None
 
 
 def plain_options(value: Any) -> Any:

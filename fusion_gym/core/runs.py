@@ -34,6 +34,7 @@ class Outcome(NamedTuple):
         cost: Tokens spent (N,).
         requested: (sensors, N) bool.
         granted: (sensors, N) bool.
+        arrived: (sensors, N) bool, the granted packets that arrive at once.
         error: Truth minus fused estimate (n, N).
         squared_error: (n, N).
         diverged: (N,) bool, whether a squared error is not finite or exceeds the task's
@@ -47,6 +48,7 @@ class Outcome(NamedTuple):
     cost: Array
     requested: NDArray[np.bool_]
     granted: NDArray[np.bool_]
+    arrived: NDArray[np.bool_]
     error: Array
     squared_error: Array
     diverged: NDArray[np.bool_]
@@ -188,6 +190,7 @@ class Runs:
             cost=spent,
             requested=requested,
             granted=delivery.granted,
+            arrived=arrived,
             error=error,
             squared_error=squared_error,
             diverged=namespace(squared_error)
@@ -264,6 +267,11 @@ class Runs:
         known, queue = self.state.network.channel, self.state.network.queue
         return np.zeros(queue.shape, dtype=np.int64) if known is None else known
 
+    def _known_arrival(self) -> Array:
+        """Return the probability (sensors, N) that a packet sent now arrives."""
+        arrival = self.arrival_probability()
+        return np.ones(self.state.network.queue.shape) if arrival is None else arrival
+
     def grantable(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) whose single request the network would grant now."""
         return self.admitted() & self.task.network.bucket.affordable(self.tokens)
@@ -288,8 +296,9 @@ class Runs:
         The estimator's signals are extended by ``tokens`` (N,), ``token_cost`` (sensors, 1),
         ``price`` (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor
         granted least recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N)
-        bool, ``channel_state`` (sensors, N), ``observation`` (N, entries), ``estimate`` (the
-        estimator's state) and the beliefs (:mod:`fusion_gym.core.signals`).
+        bool, ``channel_state`` and ``arrival_probability`` (sensors, N), ``observation`` (N,
+        entries), ``estimate`` (the estimator's state) and the beliefs
+        (:mod:`fusion_gym.core.signals`).
         """
         network, values = self.state.network, self.read()
         values |= {
@@ -302,6 +311,7 @@ class Runs:
             "admitted": self.admitted,
             "grantable": self.grantable,
             "channel_state": self.channel_state,
+            "arrival_probability": self._known_arrival,
             "observation": self.observe,
             "estimate": self.state.estimate,
         }

@@ -31,6 +31,13 @@ NETWORK_SIGNALS = (
         "state of the channel at the step before: 0 bad, 1 good",
         "own",
     ),
+    Signal(
+        "arrival_probability",
+        "centre",
+        "(sensors, N)",
+        "probability that a packet sent now arrives now, by the model",
+        "own",
+    ),
 )
 # For policies that plan, and for saved agents.
 PLANNING_SIGNALS = (

@@ -8,10 +8,12 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.admission import admit
+from fusion_gym.core.channel import Channel
 from fusion_gym.core.communication import communication
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.knowledge import Knowledge, covers, least_covering
@@ -23,6 +25,7 @@ from fusion_gym.core.plant import Plant
 from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.entries import Arguments, Options
+from fusion_gym.errors import forbidden
 
 # Knowledge class of each information mode.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "scheduler", "centre": "centre"}
@@ -33,6 +36,15 @@ SENSORS_ONLY = (
     "estimate", "beliefs", "belief_difference", "transmission_value", "own_beliefs",
     "own_difference", "own_value",
 )  # fmt: skip
+# Channels of each option, and the defaults of each channel.
+_CHANNELS = {
+    "drop_probability": ("independent", "gilbert_elliott"),
+    "channel_transition": ("gilbert_elliott",),
+    "initial_channel": ("gilbert_elliott",),
+    "true_drop_probability": ("independent",),
+}
+_DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
+_TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 _MOST_DISCRETE = 16  # sensors with a discrete action of 2^sensors values
 
 
@@ -174,7 +186,9 @@ class Task:
             plant=plant,
             estimator=scenario.estimator,
             network=Network(
-                make_bucket(options, plant.sensor_count), options.access, scenario.channel
+                make_bucket(options, plant.sensor_count),
+                options.access,
+                make_channel(options, plant.sensor_count),
             ),
             reward=reward,
             horizon=horizon if limit is None else min(horizon, limit),
@@ -285,3 +299,21 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
             stacklevel=2,
         )
     return bucket
+
+
+def make_channel(options: CommonOptions, sensors: int) -> Channel | None:
+    """Return the channel of the options; ``None`` loses nothing."""
+    kind = options.channel
+    for name, kinds in _CHANNELS.items():
+        value = getattr(options, name)
+        given = value is not None and not (isinstance(value, str) and value == "stationary")
+        if given and kind not in kinds:
+            reason = f"it belongs to {' and '.join(map(repr, kinds))}"
+            raise forbidden(name, value, reason, f"with channel={kind!r}")
+    if kind == "perfect":
+        return None
+    drop = _DROP[kind] if options.drop_probability is None else options.drop_probability
+    if kind == "independent":
+        return Channel.independent(drop, sensors, options.true_drop_probability)
+    matrix = _TRANSITION if options.channel_transition is None else options.channel_transition
+    return Channel.gilbert_elliott(matrix, drop, sensors, options.initial_channel)

@@ -303,6 +303,7 @@ def step_infos(outcome: Outcome) -> Infos:
         "reward_error": outcome.reward_error,
         "reward_cost": outcome.reward_communication,
         "granted": outcome.granted.T,
+        "arrived": outcome.arrived.T,
         "denied": (outcome.requested & ~outcome.granted).T,
         "squared_error": outcome.squared_error.T,
         "diverged": outcome.diverged,
@@ -314,7 +315,7 @@ def reset_infos(task: Task, num_envs: int) -> Infos:
     none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
     silence = np.zeros((task.sensors, num_envs), dtype=np.bool_)
     error = np.zeros((len(task.plant.state_names), num_envs))
-    outcome = Outcome(none, none, none, none, silence, silence, error, error, never, never)
+    outcome = Outcome(none, none, none, none, silence, silence, silence, error, error, never, never)
     return step_infos(outcome)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.estimator import Estimator, Reception
+from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests, Stateless
@@ -106,7 +106,7 @@ class PeriodicOptimum(Stateless):
             where = "with policy 'periodic_optimum'"
             allowed = "'any', because the search grants every request"
             raise validation.refusal("access", task.network.access, allowed, where)
-        _cycle(task.estimator)
+        _cycle(task)
         count = math.comb(period * task.sensors, packets)
         if count > _MOST:
             raise ConfigurationError(
@@ -159,7 +159,7 @@ def steady_traces(task: Task, schedules: Patterns) -> Array:
     Raises:
         ConfigurationError: the covariances depend on the data.
     """
-    length = math.lcm(len(schedules), _cycle(task.estimator))
+    length = math.lcm(len(schedules), _cycle(task))
     run = _Still(task, schedules)
     before = np.full(schedules.shape[-1], np.inf)
     for _ in range(0, _LONGEST, length):
@@ -173,7 +173,7 @@ def steady_traces(task: Task, schedules: Patterns) -> Array:
 
 def episode_traces(task: Task, schedules: Patterns, steps: int) -> Array:
     """Return traces (N,) as in :func:`steady_traces`, averaged over the first ``steps`` steps."""
-    _cycle(task.estimator)
+    _cycle(task)
     return _Still(task, schedules).total(steps) / steps
 
 
@@ -225,7 +225,11 @@ def _search(task: Task, packets: int, period: int, steps: int | None) -> Schedul
     return Schedule(best, trace)
 
 
-def _cycle(estimator: Estimator[Any]) -> int:
+def _cycle(task: Task) -> int:
+    estimator = task.estimator
+    if task.network.channel is not None and task.network.channel.loses:
+        allowed = "'perfect', because the schedule supposes arrivals"
+        raise validation.refusal("channel", task.settings["channel"], allowed)
     if estimator.covariance_cycle is None:
         raise ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(estimator).__name__}: its "

@@ -16,11 +16,9 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.channel import Channel, InitialState
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
-from fusion_gym.errors import forbidden
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
 from fusion_gym.systems.silence import Silence, Trigger
@@ -62,18 +60,6 @@ class RemoteEstimationOptions(PaperOptions):
     """Deviation σ of a source's noise: one number, or one per source."""
     initial_deviation: ArrayLike = 0.0
     """Deviation of x(0) about 0: one number, or one per source."""
-    channel: Literal["perfect", "independent", "gilbert_elliott"] = "perfect"
-    """Model of losses. ``"independent"`` loses every packet with one probability,
-    ``"gilbert_elliott"`` with a probability for each channel state."""
-    drop_probability: ArrayLike | None = None
-    """Probability of a loss. Independent: one number, or one per sensor, by default 0.2.
-    Gilbert-Elliott: the pair (bad, good), by default (0.7, 0.2)."""
-    channel_transition: ArrayLike | None = None
-    """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel.
-    By default ((0.7, 0.3), (0.1, 0.9))."""
-    initial_channel: InitialState = "stationary"
-    """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
-    law."""
     error_scale: ArrayLike | None = None
     """Divisor of the observed errors: one number, or one per source. By default about the optimal
     threshold of a random walk at a price of 5, or at the rate that the tokens allow."""
@@ -99,8 +85,6 @@ class RemoteEstimationOptions(PaperOptions):
 
 _WHERE = "with filter='symmetric'"
 _USUAL_PRICE = 5.0  # of a packet, in squared deviations of the noise
-_DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
-_TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 
 
 def build_remote(options: RemoteEstimationOptions) -> Scenario:
@@ -130,7 +114,6 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
         no_estimates="a packet carries the source's value",
         policy_defaults={} if silence is None else silence.policy_defaults,
         required_policy=options.trigger,
-        channel=_channel(options, sensors),
     )
 
 
@@ -152,25 +135,6 @@ def _nature(options: RemoteEstimationOptions, coefficient: Array) -> Nature:
     largest = float(np.abs(coefficient).max())
     nature.check_growth(lambda factor: factor * largest, validation.horizon(options.horizon))
     return nature
-
-
-def _channel(options: RemoteEstimationOptions, sensors: int) -> Channel:
-    kind = options.channel
-    if kind != "gilbert_elliott" and options.channel_transition is not None:
-        where = f"with channel={kind!r}"
-        reason = "it belongs to 'gilbert_elliott'"
-        raise forbidden("channel_transition", options.channel_transition, reason, where)
-    if kind == "perfect":
-        if options.drop_probability is not None:
-            where = "with channel='perfect'"
-            reason = "it belongs to 'independent' and 'gilbert_elliott'"
-            raise forbidden("drop_probability", options.drop_probability, reason, where)
-        return Channel.perfect(sensors)
-    drop = _DROP[kind] if options.drop_probability is None else options.drop_probability
-    if kind == "independent":
-        return Channel.independent(drop, sensors)
-    transition = _TRANSITION if options.channel_transition is None else options.channel_transition
-    return Channel.gilbert_elliott(transition, drop, sensors, options.initial_channel)
 
 
 def _error_scale(options: RemoteEstimationOptions, deviation: Array) -> Array:
