@@ -125,8 +125,8 @@ class CommonOptions:
     """Action space: one bit u_m per sensor (``"binary"``), or the number Σ u_m 2^m
     (``"discrete"``)."""
     backend: Backend = "numpy"
-    """Library that computes the steps. ``"jax"`` compiles each step in about a second and is then
-    faster than ``"numpy"`` for few runs. It needs the extra ``jax``."""
+    """Library that computes the steps. ``"jax"`` compiles the first step, in 1 to 20 seconds, and
+    is then faster than ``"numpy"`` for few runs. It needs the extra ``jax``."""
     reward: Literal["scalar", "vector"] = "scalar"
     """``"scalar"`` returns the sum of the reward's two terms, ``"vector"`` both terms."""
     error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"
