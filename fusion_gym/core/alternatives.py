@@ -34,6 +34,7 @@ def alternatives(
     taken: Outcome,
     observation: NDArray[np.float32],
     beliefs: Beliefs,
+    local: bool = False,
 ) -> Alternatives:
     """Return the outcomes of alternative requests; equal grants share one simulated step.
 
@@ -44,6 +45,7 @@ def alternatives(
         taken: Outcome of the step with the actual requests.
         observation: Observations (N, entries) after that step.
         beliefs: Beliefs after that step.
+        local: Whether observations have what the sensors suppose.
     """
     many, sensors, runs = requests.shape
     values = np.tile(np.arange(runs), many)  # columns of results, the taken step first
@@ -68,7 +70,7 @@ def alternatives(
             outcome = branch.step(sent, noise[:, run])
         error = np.concatenate((error, outcome.error), axis=-1)
         communication = np.concatenate((communication, outcome.reward_communication))
-        observation = np.concatenate((observation, branch.observe()))
+        observation = np.concatenate((observation, branch.observe(local)))
     return Alternatives(
         error[:, values].reshape(-1, many, runs),
         communication[values].reshape(many, runs),

@@ -196,12 +196,12 @@ class EpisodeBatch(Runs):
         self.finished = outcome.ended.copy()
         return outcome
 
-    def observe(self) -> NDArray[np.float32]:
+    def observe(self, local: bool = False) -> NDArray[np.float32]:
         """Return observations (N, entries); NaN in an unfinished run is a ``DivergenceError``."""
         if self._state is self._computed and self._observed is not None:
             observation = np.ascontiguousarray(self._observed.T)
         else:
-            observation = super().observe()
+            observation = super().observe(local)
         if not math.isfinite(np.vdot(observation, observation)):
             entry = np.isnan(observation).argmax(1)  # first NaN of each run
             values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}

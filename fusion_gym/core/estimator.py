@@ -53,6 +53,8 @@ class Estimator(ABC, Generic[StateT]):
         reads_silence: Whether :meth:`update` uses ``possible`` and ``failure``.
         covariance_fields: Fields of a state that depend only on the receptions; they have one
             column for all runs while the receptions (l, 1) are equal.
+        independent_nodes: Whether a sensor's part of the signals and of the observation depends on
+            no other sensor's packets.
         covariance_cycle: Period, in steps, of a covariance recursion that depends only on the
             receptions; ``None`` if it depends on the measurements.
 
@@ -73,6 +75,7 @@ class Estimator(ABC, Generic[StateT]):
     numpy_only: str | None = "system"
     reads_silence: bool = False
     covariance_fields: tuple[str, ...] = ()
+    independent_nodes: bool = False
     covariance_cycle: int | None = None
 
     @property

@@ -10,7 +10,7 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -288,6 +288,7 @@ class Signals(Mapping[str, SignalArray]):
         values: Arrays by name, or functions that compute them on first access.
         hidden: Names of signals that the information mode withholds.
         missing: Names of signals that are not computed, and the reasons.
+        nodes: The signals by what the sensors suppose; ``None`` is these signals.
 
     Raises:
         SignalError: On access to an unknown or withheld signal.
@@ -298,17 +299,18 @@ class Signals(Mapping[str, SignalArray]):
         values: Mapping[str, SignalArray | Callable[[], SignalArray]],
         hidden: Sequence[str] = (),
         missing: Mapping[str, str] | None = None,
+        nodes: Signals | None = None,
     ) -> None:
-        self._values = dict(values)
+        self._values, self.nodes = dict(values), nodes
         self._withheld = dict(missing or {}) | {
             name: f"signal {name!r} is known to the sensors only; information='centre' withholds "
             "it (use information='sensors', or a policy that reads the centre's signals)"
             for name in hidden
         }
 
-    def limit(self, refused: Mapping[str, str]) -> Self:
-        """Return the signals without the ``refused`` ones, names and reasons."""
-        result = copy.copy(self)
+    def limit(self, refused: Mapping[str, str], local: bool = False) -> Signals:
+        """Return the signals, with ``local`` the sensors', without ``refused`` ones (reasons)."""
+        result = copy.copy(self if self.nodes is None or not local else self.nodes)
         result._withheld = {**self._withheld, **refused}
         return result
 

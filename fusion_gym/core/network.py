@@ -26,8 +26,9 @@ class NetworkState:
     access rule · ``channel`` (l, N), the channels' state at the step before, which is fed back.
     Hidden are ``following`` (l, N), the channels' present state, ``lost`` (l, N) bool, whether a
     packet sent now is lost, ``delay`` (l, N), its delay in steps, ``due`` (D, l, N), the delay
-    of the packet that was sent 1, …, D steps ago, 0 without one, and ``true_drop`` (N,), the true
-    probability of a loss. ``None`` is absent.
+    of the packet that was sent 1, …, D steps ago, 0 without one, ``true_drop`` (N,), the true
+    probability of a loss, and ``unreported`` (l, N) bool, whether the sender of a packet does not
+    learn if it arrives. ``None`` is absent.
     """
 
     tokens: Array
@@ -39,6 +40,7 @@ class NetworkState:
     delay: NDArray[np.int64] | None = None
     due: NDArray[np.int64] | None = None
     true_drop: Array | None = None
+    unreported: NDArray[np.bool_] | None = None
 
 
 class Delivery(NamedTuple):
@@ -48,11 +50,14 @@ class Delivery(NamedTuple):
         granted: Sensors (l, N) bool.
         spent: Tokens spent (N,).
         reception: Packets that arrive at once.
+        supposed: Packets (l, N) bool that the sensors suppose to arrive at once; ``None`` is those
+            that arrive.
     """
 
     granted: NDArray[np.bool_]
     spent: Array
     reception: Reception
+    supposed: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,12 @@ class Network:
         access: Rule of :mod:`fusion_gym.core.access`.
         channel: Losses; ``None`` loses nothing.
         delay: Probabilities of a delay of 0, 1, … steps, drawn for each packet.
+        acknowledgement: Probability that the sender of a packet learns whether it arrives;
+            otherwise it supposes that it does.
+
+    Source: M. Nourian, A. S. Leong, S. Dey and D. E. Quevedo, "An optimal transmission strategy for
+    Kalman filtering over packet dropping links with imperfect acknowledgements", IEEE Trans.
+    Control of Network Systems 1, 2014, for acknowledgements.
 
     Raises:
         ConfigurationError: The rule is unknown, the probabilities do not sum to 1, or the channel
@@ -81,6 +92,7 @@ class Network:
     access: str = "any"
     channel: Channel | None = None
     delay: tuple[float, ...] = (1.0,)
+    acknowledgement: float = 1.0
 
     def __post_init__(self) -> None:
         validation.choice("access", self.access, ACCESS_RULES)
@@ -104,7 +116,8 @@ class Network:
     @property
     def draw_channels(self) -> int:
         """Number of standard normals that :meth:`draw` takes per run."""
-        return self.sensors * (self._moves + self._loses + (self._longest > 0))
+        parts = self._moves + self.loses + (self._longest > 0) + self._reports_some
+        return self.sensors * parts
 
     @property
     def noise_channels(self) -> int:
@@ -117,11 +130,16 @@ class Network:
         return len(self.delay) - 1
 
     @property
+    def _reports_some(self) -> bool:
+        return 0.0 < self.acknowledgement < 1.0
+
+    @property
     def _moves(self) -> bool:
         return self.channel is not None and self.channel.states > 1
 
     @property
-    def _loses(self) -> bool:
+    def loses(self) -> bool:
+        """Whether a granted packet may be lost."""
         return self.channel is not None and self.channel.loses
 
     def start(self, noise: Array) -> NetworkState:
@@ -181,17 +199,19 @@ class Network:
             noise: Standard normals (draw_channels, N).
         """
         parts = iter(noise.reshape(-1, self.sensors, noise.shape[-1]))
-        following, lost, delay = state.channel, None, None
+        following, lost, delay, unreported = state.channel, None, None, None
         if self.channel is not None and following is not None:
             following = self.channel.advance(following, next(parts))
-        if self.channel is not None and self._loses:
+        if self.channel is not None and self.loses:
             own = next(parts)
             present = np.zeros(own.shape, dtype=np.int64) if following is None else following
             lost = self.channel.lost(present, own, state.true_drop)
         if self._longest:
             reached = np.cumsum(self.delay)[:-1, None, None]
             delay = (ndtr(next(parts)) >= reached).sum(0)
-        return replace(state, following=following, lost=lost, delay=delay)
+        if self._reports_some:
+            unreported = ndtr(next(parts)) >= self.acknowledgement
+        return replace(state, following=following, lost=lost, delay=delay, unreported=unreported)
 
     def grant(
         self, state: NetworkState, requests: NDArray[np.bool_], runs: Any = slice(None)
@@ -216,7 +236,10 @@ class Network:
         """
         granted, spent, tokens, queue = self.grant(state, requests)
         left = granted if state.lost is None else granted & ~state.lost
-        reception, due = Reception(left), state.due
+        reception, due, supposed = Reception(left), state.due, None
+        if self.acknowledgement < 1.0:
+            unreported = True if state.unreported is None else state.unreported
+            supposed = granted & (left | unreported)
         if due is not None and state.delay is not None:
             due = np.concatenate(((left * state.delay)[None], due[:-1]))
             reception = Reception(left & (state.delay == 0))
@@ -237,7 +260,7 @@ class Network:
             due=due,
             true_drop=state.true_drop,
         )
-        return moved, Delivery(granted, spent, reception)
+        return moved, Delivery(granted, spent, reception, supposed)
 
     def late(self, state: NetworkState) -> NDArray[np.bool_] | None:
         """Return the packets (D, l, N) of 1, …, D steps ago that arrive now; ``None`` if never.
@@ -256,7 +279,7 @@ class Network:
         Args:
             state: State before the requests.
         """
-        if not self._loses and not self._longest:
+        if not self.loses and not self._longest:
             return None
         arrival: Any = np.ones(state.queue.shape)
         if self.channel is not None and state.channel is not None:

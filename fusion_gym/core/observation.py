@@ -195,9 +195,14 @@ class ObservationLayout:
         """Pickle the task and the owner, because the blocks' functions may not be picklable."""
         return ObservationLayout, (self._task, self._owner)
 
-    def encode(self, runs: Any) -> NDArray[np.float32]:
-        """Return observations (N, entries) float32 of ``Runs``, clipped to their bounds."""
-        filled = [block.fill(runs.state.estimate) for block in self._own]
+    def encode(self, runs: Any, estimate: Any) -> NDArray[np.float32]:
+        """Return observations (N, entries) float32, clipped to their bounds.
+
+        Args:
+            runs: ``Runs`` after sensing.
+            estimate: The estimator's state, as the owner of the observation knows it.
+        """
+        filled = [block.fill(estimate) for block in self._own]
         filled += [block.fill(runs.beliefs()) for block in self._memory]
         filled += [block.fill(runs) for block in self._network]
         xp = namespace(runs.tokens)

@@ -83,8 +83,8 @@ class CommonOptions:
     its end, and a head that the tokens do not pay for blocks the sensors behind it."""
     channel: Literal["perfect", "independent", "gilbert_elliott"] = "perfect"
     """Model of losses. ``"independent"`` loses every packet with one probability,
-    ``"gilbert_elliott"`` with a probability for each channel state. The network acknowledges what
-    arrives, and feeds the last channel states back."""
+    ``"gilbert_elliott"`` with a probability for each channel state. The network feeds the last
+    channel states back."""
     drop_probability: ArrayLike | None = None
     """Probability of a loss. Independent: one number, or one per sensor, by default 0.2.
     Gilbert-Elliott: the pair (bad, good), by default (0.7, 0.2)."""
@@ -94,6 +94,10 @@ class CommonOptions:
     initial_channel: InitialState = "stationary"
     """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
     law."""
+    acknowledgements: Literal["perfect", "none"] | float = "perfect"
+    """Whether a sensor learns that a packet arrives or is lost: always (``"perfect"``), never
+    (``"none"``), or with a probability. Otherwise it supposes an arrival: its ``held`` and ``age``
+    are of its last packet. The scheduler always knows."""
     packet: Literal["measurement", "estimate"] = "measurement"
     """Content of a packet. ``"measurement"`` is the sensor's measurement or its node's estimate.
     ``"estimate"`` is the centralised scheduler's estimate with its covariance and needs

@@ -5,6 +5,7 @@ Both halves make new arrays and change none, so runs can branch on other noise.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -62,6 +63,8 @@ class State(NamedTuple):
         plant: The plant's state.
         estimate: The estimator's state after observing.
         network: The network's state before the requests.
+        supposed: The estimator's state by the packets that the sensors suppose to have arrived;
+            ``None`` if they know.
         history: For late packets, the estimator's state before the update, the measurements and the
             arrivals (sensors, N) of the last steps, oldest first.
     """
@@ -69,6 +72,7 @@ class State(NamedTuple):
     plant: Any
     estimate: Any
     network: NetworkState
+    supposed: Any = None
     history: tuple[tuple[Any, Array, NDArray[np.bool_]], ...] = ()
 
 
@@ -171,17 +175,20 @@ class Runs:
             last = state.estimate, task.plant.measurement(state.plant), arrived
             history = (*history, last)[-len(network.due) :]
         estimate = estimator.update(state.estimate, Reception(arrived, possible, failure))
+        supposed, known = state.supposed, delivery.supposed
+        if known is not None:
+            supposed = estimator.update(supposed, Reception(known))
         if task.packet == "estimate":
             best, spread = self.beliefs().best
             estimate = estimator.adopt(estimate, best[0], spread[0], np.asarray(arrived.any(0)))
-        self.memory.update(self.beliefs, arrived)
+        self.memory.update(self.beliefs, arrived if known is None else known)
         error = task.plant.truth(state.plant) - estimator.mean(estimate)
         if available is not None:
             error = np.where(available[1], error, 0.0)
         squared_error = error * error
         covariance = estimator.covariance(estimate)
         reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
-        self._delivered = State(state.plant, estimate, network, history)
+        self._delivered = State(state.plant, estimate, network, supposed, history)
         self.steps = self.steps + 1
         return Outcome(
             reward=reward_error + reward_communication,
@@ -244,9 +251,14 @@ class Runs:
         result: Position = take_runs(whole, runs)
         return result
 
-    def observe(self) -> NDArray[np.float32]:
-        """Return new observations (N, entries) of all runs."""
-        return self.layout.encode(self)
+    def observe(self, local: bool = False) -> NDArray[np.float32]:
+        """Return new observations (N, entries), with ``local`` by what the sensors suppose."""
+        return self.layout.encode(self, self.known_to(local))
+
+    def known_to(self, local: bool) -> Any:
+        """Return the estimator's state that the scheduler or, with ``local``, the sensors know."""
+        supposed = self.state.supposed if local else None
+        return self.state.estimate if supposed is None else supposed
 
     def beliefs(self) -> Beliefs:
         """Return the beliefs of the memory's owner before any transmission."""
@@ -276,11 +288,11 @@ class Runs:
         """Return the sensors (sensors, N) whose single request the network would grant now."""
         return self.admitted() & self.task.network.bucket.affordable(self.tokens)
 
-    def read(self) -> dict[str, Any]:
+    def read(self, local: bool = False) -> dict[str, Any]:
         """Return the estimator's signals, with the network's probability of an arrival."""
         arrival = self.arrival_probability()
         failure = None if arrival is None else 1.0 - arrival
-        values = dict(self.task.estimator.read(self.state.estimate, failure))
+        values = dict(self.task.estimator.read(self.known_to(local), failure))
         reduction: Any = values.get("variance_reduction")
         if arrival is not None and reduction is not None:
             values |= {
@@ -298,9 +310,13 @@ class Runs:
         granted least recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N)
         bool, ``channel_state`` and ``arrival_probability`` (sensors, N), ``observation`` (N,
         entries), ``estimate`` (the estimator's state) and the beliefs
-        (:mod:`fusion_gym.core.signals`).
+        (:mod:`fusion_gym.core.signals`). Policies of single sensors read what these suppose.
         """
-        network, values = self.state.network, self.read()
+        nodes = None if self.state.supposed is None else self._signals(local=True)
+        return self._signals(nodes=nodes)
+
+    def _signals(self, local: bool = False, nodes: Signals | None = None) -> Signals:
+        network, values = self.state.network, self.read(local)
         values |= {
             "tokens": network.tokens,
             "token_cost": self.task.network.bucket.cost,
@@ -312,11 +328,11 @@ class Runs:
             "grantable": self.grantable,
             "channel_state": self.channel_state,
             "arrival_probability": self._known_arrival,
-            "observation": self.observe,
+            "observation": functools.partial(self.observe, local),
             "estimate": self.state.estimate,
         }
         values |= self.memory.signals(self.beliefs)
-        return Signals(values, self.task.hidden_signals, self.memory.missing_signals)
+        return Signals(values, self.task.hidden_signals, self.memory.missing_signals, nodes)
 
 
 class Branch(Runs):
@@ -360,7 +376,8 @@ def start_of(task: Task, noise: Array) -> tuple[State, Any]:
     own = task.plant.start_channels
     plant, announcement = task.plant.start(noise[:own])
     estimate = task.estimator.start(task.plant.measurement(plant), announcement)
-    return State(plant, estimate, task.network.start(noise[own:])), announcement
+    supposed = None if task.network.acknowledgement == 1.0 else estimate
+    return State(plant, estimate, task.network.start(noise[own:]), supposed), announcement
 
 
 def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) -> State:
@@ -374,10 +391,14 @@ def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) ->
     """
     own = task.plant.noise_channels
     plant = task.plant.sense(state.plant, noise[:own])
-    predicted = task.estimator.predict(state.estimate)
-    estimate = task.estimator.observe(predicted, task.plant.measurement(plant))
+    estimate, supposed = (
+        known
+        if known is None
+        else task.estimator.observe(task.estimator.predict(known), task.plant.measurement(plant))
+        for known in (state.estimate, state.supposed)
+    )
     network = task.network.advance(state.network, noise[own:], steps)
-    return State(plant, estimate, network, state.history)
+    return State(plant, estimate, network, supposed, state.history)
 
 
 def settle(task: Task, state: State) -> State:

@@ -141,6 +141,8 @@ class Task:
                 f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
                 f"plant has {states} states, so its shape must be ({states}, 1)"
             )
+        if self.network.acknowledgement < 1.0:
+            self._check_acknowledgements()
         if self.backend == "jax":
             self._refuse_jax()
 
@@ -189,6 +191,7 @@ class Task:
                 make_bucket(options, plant.sensor_count),
                 options.access,
                 make_channel(options, plant.sensor_count),
+                acknowledgement=acknowledgement(options.acknowledgements),
             ),
             reward=reward,
             horizon=horizon if limit is None else min(horizon, limit),
@@ -251,12 +254,26 @@ class Task:
         hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
         return (*hidden, *(() if covers(self.knowledge, "scheduler") else SENSORS_ONLY))
 
+    def _check_acknowledgements(self) -> None:
+        """Refuse missing acknowledgements where the sensors learn of arrivals anyway."""
+        estimator, why = self.estimator, None
+        if not self.network.loses:
+            why = "no packet is lost"
+        elif self.broadcast != "none":
+            why = f"broadcast={self.broadcast!r} acknowledges what arrives"
+        elif not estimator.independent_nodes or estimator.reads_silence:
+            why = "a sensor's innovation needs the packets of all sensors that arrived"
+        if why is not None:
+            value = self.settings.get("acknowledgements")
+            raise validation.refusal("acknowledgements", value, f"'perfect', because {why}", "here")
+
     def _refuse_jax(self) -> None:
         """Refuse options that do not run under JAX."""
         kind, own = type(self.estimator).__name__, (self.plant, self.estimator)
         fields = [part.numpy_only for part in own if part.numpy_only is not None]
         fields += [*self.plant.nature.departing, *(["memory"] if self.memory else [])]
         fields += ["belief_features"] if self.belief_features else []
+        fields += ["acknowledgements"] if self.network.acknowledgement < 1.0 else []
         fields += ["delay"] if len(self.network.delay) > 1 else []
         fields += ["error"] if callable(self.reward.error) else []
         if "system" in fields:
@@ -299,6 +316,16 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
             stacklevel=2,
         )
     return bucket
+
+
+def acknowledgement(value: str | float) -> float:
+    """Return the probability that the sender of a packet learns whether it arrives."""
+    allowed = "'perfect', 'none' or a number from 0 to 1"
+    if isinstance(value, str):
+        if value not in (words := {"perfect": 1.0, "none": 0.0}):
+            raise validation.refusal("acknowledgements", value, allowed)
+        return words[value]
+    return validation.number("acknowledgements", value, at_least=0.0, at_most=1.0)
 
 
 def make_channel(options: CommonOptions, sensors: int) -> Channel | None:

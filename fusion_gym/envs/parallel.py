@@ -136,7 +136,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         return self.batch.observe()[0]
 
     def _observations(self) -> Dict:
-        rows = self.view.rows(self.batch.observe())
+        rows = self.view.rows(self.batch.observe(local=True))
         return dict(zip(self.agents, rows, strict=True))
 
     def render(self) -> None:

@@ -116,10 +116,16 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
             return super()._advance(requests)
         before, scale = self.batch.branch(), self._scale()
         outcome = self.batch.step(requests)
-        observation = self.batch.observe()
+        observation, noise = self.batch.observe(self.view.local), self.batch.normals()
         self._observed = self.view.rows(observation)
         result = alternatives(
-            before, self._requests, self.batch.normals(), outcome, observation, self.batch.beliefs()
+            before,
+            self._requests,
+            noise,
+            outcome,
+            observation,
+            self.batch.beliefs(),
+            self.view.local,
         )
         reward = self._error_term(result.error) + result.communication
         self._branched = Branched(reward * scale, result.observation)

@@ -195,7 +195,7 @@ class FusionSB3VecEnv(VecEnv):
         return self.task.reward.price.scale(self.batch.price, self.price_exponent)
 
     def _observe(self) -> NDArray[np.float32]:
-        return self.view.rows(self.batch.observe())
+        return self.view.rows(self.batch.observe(self.view.local))
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the choices (N, choices), bool, that the network can grant as a single request."""

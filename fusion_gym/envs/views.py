@@ -2,7 +2,8 @@
 
 A view turns observations into rows and actions into requests. Its attributes are ``names`` of the
 entries, ``space`` (float32) of a row, ``actions`` (the action space), ``rows_per_run`` (adjacent
-rows of a run), ``knowledge`` (class of a row) and ``owner`` (of the batch's memory, or ``None``).
+rows of a run), ``knowledge`` (class of a row), ``local`` (whether each row belongs to a sensor) and
+``owner`` (of the batch's memory, or ``None``).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class SchedulerView:
     ``Discrete(sensors + 1)``: 0 is no request, m is sensor m - 1.
     """
 
-    rows_per_run = 1
+    rows_per_run, local = 1, False
     owner: Owner | None = None
 
     def __init__(self, task: Task) -> None:
@@ -110,6 +111,8 @@ class SensorView:
         ConfigurationError: The task has ``information="centre"``, ``packet="estimate"``, or sensors
             with different kinds of entries.
     """
+
+    local = True
 
     def __init__(self, task: Task) -> None:
         self.knowledge: Knowledge = "own_memory" if task.memory else "own"

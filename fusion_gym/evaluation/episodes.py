@@ -361,7 +361,8 @@ def _part(whole: Signals, runs: Runs) -> Signals:
     values: dict[str, Callable[[], Any]] = {
         name: partial(_take, whole, name, runs) for name in whole
     }
-    return Signals(values, missing=whole.withheld)
+    nodes = None if whole.nodes is None else _part(whole.nodes, runs)
+    return Signals(values, missing=whole.withheld, nodes=nodes)
 
 
 def _take(whole: Signals, name: str, runs: Runs) -> Any:

@@ -84,8 +84,9 @@ def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
 
 def guard(policy: Policy, task: Task) -> Callable[[Signals], Requests]:
     """Return the policy as a function that cannot read signals outside its declared knowledge."""
-    refused = refused_signals(policy, task)
-    return lambda signals: policy(signals.limit(refused))
+    refused, knower = refused_signals(policy, task), getattr(policy, "knowledge", None)
+    local = knower is not None and not covers(knower, "centre")
+    return lambda signals: policy(signals.limit(refused, local))
 
 
 def decide(policy: Policy, batch: EpisodeBatch, seed: int) -> Iterator[Requests]:

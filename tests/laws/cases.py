@@ -122,6 +122,19 @@ VARIANTS: dict[str, list[Options]] = {
 }
 
 
+# Options of the network, beside those with recorded figures.
+NETWORKS: dict[str, list[Options]] = {
+    "CorrelatedTracking": [
+        {"channel": "gilbert_elliott", "acknowledgements": "none", "memory": True},
+    ],
+    "MarkovJumpTracking": [{"channel": "independent", "acknowledgements": 0.4}],
+    "UnknownInput": [{"channel": "independent", "acknowledgements": "none"} | SCARCE],
+    "RemoteEstimation": [
+        {"sensors": 2, "channel": "independent", "acknowledgements": 0.5, "memory": True},
+    ],
+}
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """An environment with options."""
@@ -167,7 +180,8 @@ def short(env_id: str) -> str:
 CASES = [
     Case(env_id, options) for env_id in IDS for options in COMMON + VARIANTS.get(short(env_id), [])
 ]
-each_case = pytest.mark.parametrize("case", CASES, ids=str)
+NETWORK_CASES = [Case(i, options) for i in IDS for options in NETWORKS.get(short(i), [])]
+each_case = pytest.mark.parametrize("case", CASES + NETWORK_CASES, ids=str)
 each_id = pytest.mark.parametrize("env_id", IDS, ids=short)
 
 

@@ -72,7 +72,7 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
     assert env.possible_agents == [f"sensor_{m}" for m in range(task.sensors)]
     for request in requests(task, 1, 6):
         rows = np.stack(list(observations.values()))
-        np.testing.assert_array_equal(rows, view.rows(batch.observe()))
+        np.testing.assert_array_equal(rows, view.rows(batch.observe(local=True)))
         outcome = batch.step(request)
         selection = dict(zip(env.agents, request[:, 0].astype(int).tolist(), strict=True))
         observations, rewards, terminated, truncated, infos = env.step(selection)
@@ -95,6 +95,7 @@ def test_sensors_rows_of_stable_baselines_are_the_schedulers_runs(case: Case) ->
     local = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, local=True, **options)
     whole = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, **options)
     whole.batch = EpisodeBatch(whole.task, 3, local.view.owner)  # remembers for whom it is compared
+    whole.view.local = True  # and supposes what the sensors suppose
     sensors = case.task().sensors
     assert local.num_envs == 3 * sensors
     np.testing.assert_array_equal(local.reset(), local.view.rows(whole.reset()))

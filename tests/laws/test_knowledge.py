@@ -164,7 +164,7 @@ def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
             else:
                 assert not differs(value[None], base).any(), signal.name
         if view is not None:
-            rows = view.rows(runs.observe()).reshape(len(sensor), task.sensors, -1)
+            rows = view.rows(runs.observe(local=True)).reshape(len(sensor), task.sensors, -1)
             own = [rows.transpose(1, 2, 0)]
             own += [runs.signals()[name] for name in ("own_difference", "own_value")]
             for value in own:

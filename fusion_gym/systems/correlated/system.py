@@ -150,6 +150,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
     joint: JointErrorCovariance | None = None
     signals = SIGNALS
     covariance_fields = ("prior_covariance", "covariances", "joint")
+    independent_nodes = True
     covariance_cycle = 1  # the recursion of the covariances does not depend on time
 
     @property

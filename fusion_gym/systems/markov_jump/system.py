@@ -203,6 +203,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
     recursion: LagRecursion
     fusion: FusionRule
     signals = SIGNALS
+    independent_nodes = True
 
     @property
     def covariance_cycle(self) -> int:  # type: ignore[override]

@@ -158,6 +158,8 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
     silence: Silence | None = None
     signals = SIGNALS
 
+    independent_nodes = True
+
     @property
     def numpy_only(self) -> str | None:  # type: ignore[override]
         """See :class:`Estimator`."""

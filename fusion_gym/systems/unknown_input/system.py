@@ -186,6 +186,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
 
     nodes: Nodes
     signals = SIGNALS
+    independent_nodes = True
 
     @property
     def covariance_cycle(self) -> int | None:  # type: ignore[override]
