@@ -135,8 +135,9 @@ $(VENV)/.docs: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,docs]'
 	touch $@
 
-pages: $(STAMP)  ## the tables of the pages in docs/, from the code
+pages: $(STAMP)  ## tables and the picture of networks in docs/, from the code
 	$(BIN)/python -m docs.tables
+	$(BIN)/python -m docs.protocols
 
 docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links and length of its prose checked
 	$(BIN)/python -m docs.tables --check

@@ -7,22 +7,39 @@ import inspect
 import pydoc
 import re
 import sys
+import warnings
 from pathlib import Path
 from typing import Any, cast
 
+from fusion_gym.core.access import ACCESS
 from fusion_gym.core.knowledge import MEANING
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in, short
-from fusion_gym.envs.registration import make_task, options_of
+from fusion_gym.envs.registration import ENVIRONMENTS, make_task, options_of
 from fusion_gym.envs.views import make_view
+from fusion_gym.errors import ConfigurationError
 from fusion_gym.evaluation.metrics import metric_table
 from fusion_gym.fusion.table import RULES
-from fusion_gym.policies.registry import Kind, policy_maker, policy_names, policy_parameters
+from fusion_gym.policies.registry import (
+    Kind,
+    make_policy,
+    policy_maker,
+    policy_names,
+    policy_parameters,
+)
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.training.algorithms import algorithm_table
 
+# Interfaces by letter: a further option, and a policy that runs there.
+_INTERFACES = {
+    "N": ("backend=numpy", "always"),
+    "J": ("backend=jax", "always"),
+    "R": ("memory=true", "rollout:base=never"),
+    "P": ("", "periodic_optimum:packets=1,period=1"),
+    "S": ("", "optimal"),
+}
 _LEGEND = "Only sensors know an entry with a star ([who knows what](concepts.md#who-knows-what))."
 _WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
 
@@ -71,6 +88,29 @@ def option_table(text: str) -> str:
     return table(("option", "type", "default", "meaning"), rows)
 
 
+def network_table(text: str) -> str:
+    """Return where sets of options run, ``name=value … ; …``, by the letters of ``_INTERFACES``."""
+    ids = {env_id: env_id.partition("/")[2].partition("-")[0] for env_id in ENVIRONMENTS}
+    rows = []
+    for options in " ".join(text.split()).split("; "):
+        cells = [
+            "".join(letter for letter in _INTERFACES if _runs(letter, f"{env_id} {options}")) or "–"
+            for env_id in ids
+        ]
+        rows.append((f"`{options}`", *cells))
+    return table(("options", *ids.values()), rows)
+
+
+def _runs(letter: str, text: str) -> bool:
+    more, policy = _INTERFACES[letter]
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            make_policy(policy, task_of(f"{text} {more}".strip()))
+    except ConfigurationError:
+        return False
+    return True
+
+
 def task_of(text: str) -> Task:
     """Return the task of the text ``ID name=value …``."""
     env_id, *options = text.split()
@@ -94,6 +134,12 @@ def fusion_table(text: str) -> str:
         if text == "all" or name in getattr(options_of(text).structure, "offered", ())
     )
     return table(("`fusion`", "class", "assumes", "meaning"), rows)
+
+
+def access_table(_: str) -> str:
+    """Return the rules of medium access."""
+    rows = ((f'`"{name}"`', plain_marks(row.meaning)) for name, row in ACCESS.items())
+    return table(("`access`", "meaning"), rows)
 
 
 def policy_table(text: str) -> str:
@@ -123,8 +169,9 @@ def name_table(text: str) -> str:
 
 
 TABLES = {
-    "algorithms": algorithm_table, "facts": fact_table, "filters": filter_table,
-    "fusion": fusion_table, "metrics": metric_table, "names": name_table,
+    "access": access_table, "algorithms": algorithm_table, "facts": fact_table,
+    "filters": filter_table, "fusion": fusion_table, "metrics": metric_table, "names": name_table,
+    "networks": network_table,
     "observation": observation_table, "options": option_table, "policies": policy_table,
 }  # fmt: skip
 PART = re.compile(r"(?ms)^(<!-- table: (\w+)\s([^>]+?)\s-->\n).*?^(<!-- end -->)$")

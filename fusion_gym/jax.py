@@ -263,7 +263,7 @@ class FunctionalEnv:
         action, shape = jnp.asarray(action), self._view.actions.shape
         if action.shape != shape:
             raise ValueError(f"action of shape {action.shape} is not allowed: it must be {shape}")
-        if isinstance(self._view.actions, spaces.MultiBinary):
+        if not isinstance(self._view.actions, spaces.Discrete):
             return action.reshape(-1, 1).astype(np.bool_)
         sensors = jnp.arange(self.task.sensors)[:, None]
         if self.task.network.access == "single":

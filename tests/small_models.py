@@ -14,6 +14,7 @@ from fusion_gym.core.task import Task
 ENV = "fusion_gym/TobitOscillator-v1"
 OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20}
 DISCRETE, LOCAL, MEMORY = {"action": "discrete"}, {"local": True}, {"memory": True}
+MULTI = {"action": "multidiscrete"}
 RELU = {"net_arch": {"pi": [8], "vf": [6, 5]}, "activation_fn": torch.nn.ReLU}
 GELU = {"activation_fn": torch.nn.GELU}
 SHARED = {"lstm_hidden_size": 6, "n_lstm_layers": 2, "shared_lstm": True}
@@ -54,6 +55,9 @@ MODELS = {
     "dqn": Recipe(DQN, options=DISCRETE, arguments={"buffer_size": 10}),
     "dqn_local": Recipe(DQN, options=LOCAL, arguments={"buffer_size": 10, "seed": 2}),
     "maskable_binary": Recipe(MaskablePPO),
+    "ppo_multidiscrete": Recipe(PPO, options=MULTI),
+    "maskable_multidiscrete": Recipe(MaskablePPO, options=MULTI),
+    "recurrent_multidiscrete": recurrent(MULTI, ortho_init=False),
     "maskable_single": Recipe(MaskablePPO, options={"access": "single"}),
     "maskable_discrete": Recipe(MaskablePPO, options=DISCRETE),
     "maskable_local": Recipe(MaskablePPO, options=LOCAL),

@@ -311,6 +311,9 @@ BAD_ACTIONS: list[tuple[str, Any, tuple[str, ...]]] = [
     ("binary", [1, np.nan, 0], ("nan", "0 or 1")),
     ("binary", [0, -1, 0], ("= -1", "0 or 1")),
     ("binary", [[1, 0, 1]], ("shape",)),
+    ("multidiscrete", [1, np.nan, 0], ("nan", "0 or 1")),
+    ("multidiscrete", [0, 2, 0], ("= 2", "0 or 1")),
+    ("multidiscrete", [1, 0, 1, 0], ("shape",)),
     ("discrete", 8, ("= 8", "0..7")),
     ("discrete", np.array(3, dtype=object), ("object",)),
 ]

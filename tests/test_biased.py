@@ -10,7 +10,7 @@ from scipy import integrate, stats
 
 import fusion_gym
 from fusion_gym import linalg
-from fusion_gym.core.access import first_request
+from fusion_gym.core.access import first_requests
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
@@ -202,7 +202,7 @@ def test_two_sided_sensors_clip_and_tell() -> None:
 @given(bits=st.lists(st.booleans(), min_size=1, max_size=6), seed=st.integers(0, 2**31))
 def test_single_access_lets_one_request_through(bits: list[bool], seed: int) -> None:
     place = np.random.default_rng(seed).permutation(len(bits))
-    passed = first_request(np.array(bits)[:, None], place[:, None])[:, 0]
+    passed = first_requests(np.array(bits)[:, None], place[:, None])[:, 0]
     first = min(np.flatnonzero(bits), key=place.__getitem__, default=None)
     assert np.flatnonzero(passed).tolist() == [first] * any(bits)
 

@@ -25,6 +25,7 @@ BERNOULLI, CATEGORICAL = torch.distributions.Bernoulli, torch.distributions.Cate
 CASES: dict[str, tuple[dict[str, Any], bool, str | None]] = {
     "all": ({}, False, None),
     "flips": ({}, False, "flips"),
+    "multidiscrete": ({"action": "multidiscrete"}, False, None),
     "discrete": ({"action": "discrete"}, False, None),
     "single": ({"access": "single"}, False, None),
     "local": ({}, True, None),

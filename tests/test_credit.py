@@ -78,6 +78,24 @@ def test_masked_requests_have_no_probability(kind: Any) -> None:
     torch.testing.assert_close(apart, usual)
 
 
+@pytest.mark.parametrize("action", ["binary", "multidiscrete", "discrete"])
+@pytest.mark.parametrize("learner", [CounterfactualPPO, CounterfactualMaskablePPO])
+def test_the_credited_chances_are_the_policys(learner: Any, action: str) -> None:
+    env = env_of(action=action)
+    env.reset()
+    model = learner("MlpPolicy", env, batch_size=30, seed=0)
+    with torch.no_grad():
+        model.policy.action_net.weight.mul_(100.0)
+    observations = torch.rand((5, *model.observation_space.shape))
+    masks: Any = torch.ones(env.action_masks().shape, dtype=torch.bool)
+    masks = masks if learner is CounterfactualMaskablePPO else None
+    values = model._decisions.log_probabilities(model._logits(observations, masks))
+    choice = torch.randint(0, model._decisions.choices, values.shape[:2])
+    actions = torch.as_tensor(model._decisions.actions(choice.numpy())).float()
+    expected = model.policy.evaluate_actions(observations, actions)[1]
+    torch.testing.assert_close(values.gather(-1, choice[..., None]).sum((-1, -2)), expected)
+
+
 def test_an_episode_cut_short_is_worth_what_its_last_observation_is() -> None:
     """Not what the next episode begins with: there the age is less."""
     env = env_of(horizon=2, token_rate=0.0, initial_tokens=0.0)

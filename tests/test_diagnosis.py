@@ -27,7 +27,7 @@ COUNTERFACTUAL = {"n_steps": 8, "batch_size": 32, "n_epochs": 1}
 def trained(folder: Path, kind: str, local: bool = False, **options: Any) -> Experiment:
     """A short training on drawn prices."""
     choice = SMALL.get(kind, {"name": kind, **COUNTERFACTUAL})
-    if TABLE[kind].discrete_only:
+    if "binary" not in TABLE[kind].actions:
         options["action"] = "discrete"
     environment = {"id": ENV, "options": FRONT | options, "local": local}
     training = {"timesteps": 512, "num_envs": 8, "price_exponent": 0.5}

@@ -56,7 +56,7 @@ QUESTIONS = {
     "the list of rules": "docs/rules.md#rules",
     "the list of filters": "docs/filters.md#filters",
     "the metrics": "docs/policies.md#metrics",
-    "losses and delays": "docs/environments.md#losses-and-delays",
+    "losses and delays": "docs/networks.md#delays",
     "whether SAC, TD3 or RecurrentPPO work": "docs/algorithms.md#which-algorithm-works",
     "VecNormalize": "docs/algorithms.md#vecnormalize",
     "a plant of one's own": "docs/your_system.md#",

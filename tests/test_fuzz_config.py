@@ -27,7 +27,7 @@ def plain(kind: str) -> Content:
     """A config of this algorithm with all its fields, small enough to make in no time."""
     content = load_checked(Experiment, "remote_estimation_ppo").model_dump(mode="json")
     content["environment"]["options"]["horizon"] = 20
-    if TABLE[kind].discrete_only:
+    if "binary" not in TABLE[kind].actions:
         content["environment"]["options"]["action"] = "discrete"
     content["training"]["num_envs"] = 2
     content["algorithm"] = TABLE[kind].config(name=kind).model_dump(mode="json")

@@ -252,11 +252,13 @@ def test_resets_and_steps_draw_from_independent_keys() -> None:
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), renewed, again)
 
 
-@pytest.mark.parametrize("options", [{"action": "discrete"}, {"access": "single"}, {}])
+@pytest.mark.parametrize(
+    "options", [{"action": "discrete"}, {"action": "multidiscrete"}, {"access": "single"}, {}]
+)
 def test_requests_are_those_of_the_usual_interfaces(options: dict[str, Any]) -> None:
     env = fusion_gym.jax.make(SMALL, sensors=3, **options)[0]
-    numbers = np.arange(env.num_actions)
-    actions = numbers if options else [[0, 0, 1], [1, 0, 0], [1, 1, 0]]
+    bits = [[0, 0, 1], [1, 0, 0], [1, 1, 0]]
+    actions = bits if env.action_space().shape else range(env.num_actions)
     for action in actions:
         np.testing.assert_array_equal(env.requests(action), env._view.requests(action, None))
 

@@ -87,14 +87,14 @@ def test_up_to_their_bounds_they_are_not_refused() -> None:
     linear(16, action="discrete")
 
 
-@pytest.mark.parametrize("action", ["binary", "discrete"])
+@pytest.mark.parametrize("action", ["binary", "multidiscrete", "discrete"])
 def test_all_alternatives_are_those_of_few_sensors(action: str) -> None:
     def decisions(sensors: int) -> Decisions:
         env = PrivilegedVecEnv(sources(sensors, action=action), 2)
         return Decisions(env, "all")
 
     assert decisions(10).choices == 1024
-    instead = "'flips'" if action == "binary" else "'binary'"
+    instead = "'binary'" if action == "discrete" else "'flips'"
     with pytest.raises(ConfigurationError, match=rf"11 sensors: it steps all 2\^11 .*{instead}"):
         decisions(11)
 

@@ -20,7 +20,10 @@ ENV_ID = "fusion_gym/TobitOscillator-v1"
 BIASED = "fusion_gym/BiasedOscillator-v1"
 
 
-@pytest.mark.parametrize("options", [{}, {"action": "discrete"}, {"access": "single"}])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"action": "multidiscrete"}, {"action": "discrete"}, {"access": "single"}],
+)
 def test_masks_close_exactly_the_actions_with_closed_sensors(options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(ENV_ID, **options)
     patterns = np.array(list(product((False, True), repeat=3))).T

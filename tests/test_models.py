@@ -38,6 +38,9 @@ def experiment(algorithm: str = "ppo", local: bool = False, **options: Any) -> E
         ("ppo", True, {"memory": True}),
         ("ppo", False, {"action": "discrete"}),
         ("recurrent_ppo", False, {"action": "discrete"}),
+        ("ppo", False, {"action": "multidiscrete"}),
+        ("maskable_ppo", False, {"action": "multidiscrete"}),
+        ("recurrent_ppo", False, {"action": "multidiscrete"}),
         ("ppo", False, {"access": "single"}),
     ],
 )

@@ -192,7 +192,7 @@ class Rememberer(Liar):
 
 def dug_up(signals: Signals, name: str) -> Any:
     """A field of the whole state, by way of a method that knows it; zeros where there is none."""
-    batch: Any = getattr(signals._values["observation"], "__self__", None)
+    batch: Any = getattr(signals._values["admitted"], "__self__", None)
     return 0.0 if batch is None else np.asarray(attrgetter(name)(batch.state)[0], dtype=float)
 
 

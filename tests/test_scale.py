@@ -48,14 +48,14 @@ def error_cost(task: Task, policy: str, episodes: int = 400) -> float:
 @pytest.mark.parametrize("env_id", OPTIONS)
 def test_an_even_pace_costs_about_one_a_step(env_id: str) -> None:
     task = fusion_gym.make_task(env_id, reward_scale="auto", **OPTIONS[env_id])
-    rate = nominal_rate(task.network.bucket, task.network.access)
+    rate = nominal_rate(task.network)
     assert error_cost(task, f"paced:rate={rate}") == pytest.approx(1.0, rel=0.12)
 
 
 @pytest.mark.parametrize("access", ["round_robin", "random", "single"])
 def test_the_pace_keeps_to_the_turns_of_the_access_rule(access: str) -> None:
     auto = fusion_gym.make_task(LINEAR, access=access, tokens="unlimited", **DRIFT)
-    assert nominal_rate(auto.network.bucket, access) == pytest.approx(1.0 / 12.0)
+    assert nominal_rate(auto.network) == pytest.approx(1.0 / 12.0)
     assert error_cost(auto, "never") > 100.0
     assert error_cost(auto, "paced:rate=1") < 1.0
 

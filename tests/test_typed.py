@@ -12,6 +12,7 @@ import gymnasium as gym
 import pytest
 
 import fusion_gym
+from fusion_gym.core.access import ACCESS
 from fusion_gym.envs import registered
 from fusion_gym.envs.option_text import FOR_ALL, short
 from fusion_gym.envs.registration import ENVIRONMENTS, FusionSpec, class_name, options_of
@@ -80,7 +81,7 @@ def test_the_specification_lists_every_option(env_id: str) -> None:
     for name in own:
         place = lines.index(f"{name}: {options[name].type} = {short(getattr(kind(), name))}")
         assert lines[place + 1] == options[name].meaning
-    assert options["access"].type == "'any' | 'single' | 'round_robin' | 'random'"
+    assert options["access"].type == " | ".join(map(repr, ACCESS))
     assert options["price_range"].type == "ArrayLike | 'auto' | None"
     for ending in ("Env", "VectorEnv"):  # what an editor shows of the class, and help
         parameters = inspect.signature(getattr(registered, class_name(env_id) + ending)).parameters

@@ -29,7 +29,7 @@ def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
         "calibration": None,
         "output": str(folder / "run"),
     }
-    if TABLE[kind].discrete_only:
+    if "binary" not in TABLE[kind].actions:
         content["environment"]["options"]["action"] = "discrete"
     path = folder / "config.yaml"
     path.write_text(yaml.safe_dump(content | changes))

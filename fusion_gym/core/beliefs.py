@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.estimator import Estimator, Reception
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import ONE_STEP, Task
 from fusion_gym.fusion.intersection import covariance_intersection
 
 Owner = Literal["scheduler", "own"]
@@ -247,6 +247,7 @@ class SchedulerBeliefs(Beliefs):
     @cached_property
     def sent(self) -> Estimate:
         """x̂(s); with ``packet="estimate"`` it is x* for every s."""
+        self.task.refuse_delay(ONE_STEP)
         if self.task.packet == "estimate":
             return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
         single = self.task.estimator.single_deliveries(self._estimate)

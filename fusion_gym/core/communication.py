@@ -24,8 +24,8 @@ class Communication(NamedTuple):
     features: tuple[str, ...]
 
 
-def communication(scenario: Scenario) -> Communication:
-    """Return the checked communication model of a scenario."""
+def communication(scenario: Scenario, delayed: bool = False) -> Communication:
+    """Return the checked communication model of a scenario, with or without delays."""
     options = scenario.options
     has_memory, memory_estimator = options.memory, scenario.memory_estimator
     if memory_estimator is None and not scenario.nodes_have_memory:
@@ -35,7 +35,7 @@ def communication(scenario: Scenario) -> Communication:
         raise validation.refusal("memory", True, allowed, "with information='centre'")
     if options.memory_filter is not None and not has_memory:
         raise validation.refusal("memory_filter", options.memory_filter, "None unless memory=True")
-    features = _features(options.belief_features, has_memory)
+    features = _features(options.belief_features, has_memory, delayed)
     if features and options.information == "centre":
         allowed = "None or empty with information='centre'"
         raise validation.refusal("belief_features", options.belief_features, allowed)
@@ -67,10 +67,11 @@ def _broadcast(scenario: Scenario) -> str:
     return value
 
 
-def _features(value: Any, has_memory: bool) -> tuple[str, ...]:
+def _features(value: Any, has_memory: bool, delayed: bool) -> tuple[str, ...]:
     """Return the observation entries of the memory, by default all with memory."""
     if value is None:
-        return FEATURES if has_memory else ()
+        usual = ("difference",) if delayed else FEATURES
+        return usual if has_memory else ()
     if value is True:
         return FEATURES
     values = (value,) if isinstance(value, str) else value

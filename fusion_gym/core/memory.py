@@ -63,8 +63,9 @@ class Memory:
         if own and task.packet == "estimate":
             why = "with local sensors, because the estimate belongs to the scheduler"
             raise refusal("packet", task.packet, f"'measurement' {why}")
-        if own and len(task.network.delay) > 1:
-            raise refusal("delay", task.network.delay, "none with the memory of local sensors")
+        if own:
+            reason = "their model of the centre has only packets that arrive at once"
+            task.refuse_delay(reason, "with the memory of local sensors")
         self.parts: dict[str, MemoryPart] = {}
         if task.memory_estimator is not None:
             if own:
@@ -204,8 +205,8 @@ class Memory:
 
     @property
     def missing_signals(self) -> Mapping[str, str]:
-        """Names of the signals of another owner's beliefs, and the reasons for their absence."""
-        return missing_signals(self.owner)
+        """Names of the signals that are not computed, and the reasons for their absence."""
+        return missing_signals(self.owner, len(self.task.network.delay) > 1)
 
     def _make_beliefs(
         self, estimate: Any, arrival: Array | None, best: Estimate | None = None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.access import ACCESS_RULES, access_mask, first_request
+from fusion_gym.core.access import ACCESS, AccessRow, collisions, first_requests
 from fusion_gym.core.channel import Channel
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.token_bucket import Grants, Queue, TokenBucket
@@ -23,12 +23,13 @@ class NetworkState:
     """The network of N runs before the requests of a step; l sensors, delays of at most D steps.
 
     ``tokens`` (N,) · ``queue`` (l, N), the place of each sensor · ``admitted`` (l, N) bool, by the
-    access rule · ``channel`` (l, N), the channels' state at the step before, which is fed back.
-    Hidden are ``following`` (l, N), the channels' present state, ``lost`` (l, N) bool, whether a
-    packet sent now is lost, ``delay`` (l, N), its delay in steps, ``due`` (D, l, N), the delay
-    of the packet that was sent 1, …, D steps ago, 0 without one, ``true_drop`` (N,), the true
-    probability of a loss, and ``unreported`` (l, N) bool, whether the sender of a packet does not
-    learn if it arrives. ``None`` is absent.
+    access rule · ``channel`` (l, N), the channels' state at the step before, which is fed back ·
+    ``place`` (l, N), 0 for the largest discrepancy. Hidden are ``following`` (l, N), the channels'
+    present state, ``lost`` (l, N) bool, whether a packet sent now is lost, ``frequency`` (l, N),
+    its channel, ``delay`` (l, N), its delay in steps, ``due`` (D, l, N), the delay of the packet
+    that was sent 1, …, D steps ago, 0 without one, ``true_drop`` (N,), the true probability of a
+    loss, and ``unreported`` (l, N) bool, whether the sender of a packet does not learn if it
+    arrives. ``None`` is absent.
     """
 
     tokens: Array
@@ -41,6 +42,8 @@ class NetworkState:
     due: NDArray[np.int64] | None = None
     true_drop: Array | None = None
     unreported: NDArray[np.bool_] | None = None
+    place: NDArray[np.int64] | None = None
+    frequency: NDArray[np.int64] | None = None
 
 
 class Delivery(NamedTuple):
@@ -66,11 +69,15 @@ class Network:
 
     Args:
         bucket: The token bucket.
-        access: Rule of :mod:`fusion_gym.core.access`.
+        access: Name of a rule of :mod:`fusion_gym.core.access`.
         channel: Losses; ``None`` loses nothing.
         delay: Probabilities of a delay of 0, 1, … steps, drawn for each packet.
         acknowledgement: Probability that the sender of a packet learns whether it arrives;
             otherwise it supposes that it does.
+        slots: Most grants in a step of an access rule with slots.
+        channels: Number of channels of an access rule with collisions.
+        discrepancy: ``"innovation"`` or ``"held"`` (:func:`~fusion_gym.core.access.discrepancy`).
+        weights: Weights of the discrepancies, one number or (l, 1).
 
     Source: M. Nourian, A. S. Leong, S. Dey and D. E. Quevedo, "An optimal transmission strategy for
     Kalman filtering over packet dropping links with imperfect acknowledgements", IEEE Trans.
@@ -93,9 +100,13 @@ class Network:
     channel: Channel | None = None
     delay: tuple[float, ...] = (1.0,)
     acknowledgement: float = 1.0
+    slots: int = 1
+    channels: int = 1
+    discrepancy: str = "innovation"
+    weights: Array | float = 1.0
 
     def __post_init__(self) -> None:
-        validation.choice("access", self.access, ACCESS_RULES)
+        validation.choice("access", self.access, ACCESS)
         law = validation.not_negative("delay", self.delay, (len(self.delay),))
         if abs(law.sum() - 1.0) > 1e-9:
             raise forbidden("delay", self.delay, "it must have probabilities that sum to 1")
@@ -109,6 +120,11 @@ class Network:
         return len(self.bucket.cost)
 
     @property
+    def rule(self) -> AccessRow:
+        """The rule of medium access."""
+        return ACCESS[self.access]
+
+    @property
     def start_channels(self) -> int:
         """Number of standard normals that :meth:`start` takes per run."""
         return 0 if self.channel is None else self.channel.start_channels
@@ -116,13 +132,13 @@ class Network:
     @property
     def draw_channels(self) -> int:
         """Number of standard normals that :meth:`draw` takes per run."""
-        parts = self._moves + self.loses + (self._longest > 0) + self._reports_some
-        return self.sensors * parts
+        parts = (self._moves, self._drops, self._longest > 0, self._reports_some, self._hops)
+        return self.sensors * sum(parts)
 
     @property
     def noise_channels(self) -> int:
         """Number of standard normals that :meth:`advance` takes per run."""
-        return (self.access == "random") + self.draw_channels
+        return self.rule.random + self.draw_channels
 
     @property
     def _longest(self) -> int:
@@ -138,8 +154,11 @@ class Network:
         return self.channel is not None and self.channel.states > 1
 
     @property
-    def loses(self) -> bool:
-        """Whether a granted packet may be lost."""
+    def _hops(self) -> bool:
+        return self.rule.contended and self.channels > 1
+
+    @property
+    def _drops(self) -> bool:
         return self.channel is not None and self.channel.loses
 
     def start(self, noise: Array) -> NetworkState:
@@ -174,11 +193,10 @@ class Network:
             noise: Standard normals (noise_channels, N).
             step: Steps taken so far (N,).
         """
-        admitted = state.admitted
-        if self.access in ("round_robin", "random"):
-            lottery = noise[0] if self.access == "random" else None
-            admitted = access_mask(self.access, self.sensors, step, lottery)
-            noise = noise if lottery is None else noise[1:]
+        admitted, turn = state.admitted, self.rule.turn
+        if turn is not None:
+            admitted = np.arange(self.sensors)[:, None] == turn(self.sensors, step, noise)
+        noise = noise[1:] if self.rule.random else noise
         following = state.following
         moved = NetworkState(
             state.tokens,
@@ -199,10 +217,10 @@ class Network:
             noise: Standard normals (draw_channels, N).
         """
         parts = iter(noise.reshape(-1, self.sensors, noise.shape[-1]))
-        following, lost, delay, unreported = state.channel, None, None, None
+        following, lost, delay, unreported, frequency = state.channel, None, None, None, None
         if self.channel is not None and following is not None:
             following = self.channel.advance(following, next(parts))
-        if self.channel is not None and self.loses:
+        if self.channel is not None and self._drops:
             own = next(parts)
             present = np.zeros(own.shape, dtype=np.int64) if following is None else following
             lost = self.channel.lost(present, own, state.true_drop)
@@ -211,17 +229,28 @@ class Network:
             delay = (ndtr(next(parts)) >= reached).sum(0)
         if self._reports_some:
             unreported = ndtr(next(parts)) >= self.acknowledgement
-        return replace(state, following=following, lost=lost, delay=delay, unreported=unreported)
+        if self._hops:
+            drawn = (ndtr(next(parts)) * self.channels).astype(np.int64)
+            frequency = namespace(drawn).minimum(drawn, self.channels - 1)
+        return replace(
+            state,
+            following=following,
+            lost=lost,
+            delay=delay,
+            unreported=unreported,
+            frequency=frequency,
+        )
 
     def grant(
         self, state: NetworkState, requests: NDArray[np.bool_], runs: Any = slice(None)
     ) -> Grants:
         """Return the grants for requests (l, R) of the R ``runs``."""
         queue = state.queue[:, runs]
-        if self.access in ("round_robin", "random"):
+        if self.rule.turn is not None:
             requests = requests & state.admitted[:, runs]
-        if self.access == "single":
-            requests = first_request(requests, queue)
+        if self.rule.limited:
+            place = queue if state.place is None else state.place[:, runs]
+            requests = first_requests(requests, place, self.slots)
         return self.bucket.grant(state.tokens[runs], requests, queue)
 
     def deliver(
@@ -236,6 +265,9 @@ class Network:
         """
         granted, spent, tokens, queue = self.grant(state, requests)
         left = granted if state.lost is None else granted & ~state.lost
+        if self.rule.contended:
+            frequency = 0 if state.frequency is None else state.frequency
+            left = left & ~collisions(granted, frequency, self.channels)
         reception, due, supposed = Reception(left), state.due, None
         if self.acknowledgement < 1.0:
             unreported = True if state.unreported is None else state.unreported
@@ -246,8 +278,8 @@ class Network:
         if reads_silence:
             before = state.tokens if self.bucket.sharing == "equal" else state.tokens - spent
             possible = state.admitted & self.bucket.affordable(before)
-            if self.access == "single":
-                possible = possible & ~granted.any(0)
+            if self.rule.limited:
+                possible = possible & (granted.sum(0) < self.slots)
             arrival = self.arrival_probability(state)
             failure = None if arrival is None else 1.0 - arrival
             reception = reception._replace(possible=possible, failure=failure)
@@ -272,14 +304,14 @@ class Network:
         return None if state.due is None else state.due == steps[:, None, None]
 
     def arrival_probability(self, state: NetworkState) -> Array | None:
-        """Return the probability (l, N) that a packet sent now arrives now; ``None`` is 1.
+        """Return the probability (l, N) that a packet sent now, alone, arrives now; ``None`` is 1.
 
         It follows from the channels' state that was fed back.
 
         Args:
             state: State before the requests.
         """
-        if not self.loses and not self._longest:
+        if not self._drops and not self._longest:
             return None
         arrival: Any = np.ones(state.queue.shape)
         if self.channel is not None and state.channel is not None:

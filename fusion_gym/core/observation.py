@@ -82,12 +82,11 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         lambda runs: price.encode(runs.price),
         constants={} if price.span is None else {"range": price.span},
     )
-    decides = task.network.access in ("round_robin", "random")
     queues = bucket.sharing == "turns" and not bucket.unlimited
     return (
         *((channels,) if channel is not None and channel.states > 1 else ()),
         tokens,
-        *((admitted,) if decides else ()),
+        *((admitted,) if task.network.rule.turn is not None else ()),
         *((queue,) if queues else ()),
         *((left,) if task.clock else ()),
         *((block,) if price.span is not None else ()),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import declaration, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.access import ACCESS
 from fusion_gym.core.channel import InitialState
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.noise import NoiseSource
@@ -20,18 +21,19 @@ from fusion_gym.errors import refusal
 from fusion_gym.fusion.table import Structure
 from fusion_gym.importing import name_of
 
-AccessRule = Literal["any", "single", "round_robin", "random"]
+AccessRule = Annotated[str, ACCESS]
 Tokens = Literal["limited", "unlimited"]
 SharingRule = Literal["equal", "fixed", "turns"]
 ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
-Action = Literal["binary", "discrete"]
+Action = Literal["binary", "multidiscrete", "discrete"]
 Backend = Literal["numpy", "jax"]
 # Options that affect the scale of the reward, besides plant and sensors.
 _SCALING = (
-    "access", "tokens", "token_rate", "token_capacity", "initial_tokens", "token_cost", "sharing",
-    "horizon", "channel", "drop_probability", "channel_transition", "initial_channel",
+    "access", "slots", "discrepancy", "discrepancy_weights", "channels", "tokens", "token_rate",
+    "token_capacity", "initial_tokens", "token_cost", "sharing", "horizon", "channel",
+    "drop_probability", "channel_transition", "initial_channel", "delay",
 )  # fmt: skip
 
 
@@ -62,9 +64,20 @@ class CommonOptions:
 
     access: AccessRule = "any"
     """Rule of medium access. ``"any"`` admits all requests, ``"single"`` the first in the queue.
-    ``"round_robin"`` admits one sensor per step in turn, ``"random"`` one at random. With
-    ``"single"`` the action space is ``Discrete(sensors + 1)``: 0 is no request, m + 1 is
-    sensor m."""
+    ``"round_robin"`` admits one sensor per step in turn, ``"random"`` one at random. ``"slots"``
+    grants the first ``slots`` requests in the queue, ``"try_once_discard"`` those with the largest
+    discrepancies. With ``"collision"`` every request goes to one of ``channels`` at random, and two
+    on one are lost and paid for. With ``"single"`` the action space is ``Discrete(sensors + 1)``: 0
+    is no request, m + 1 is sensor m."""
+    slots: int = 1
+    """Most grants in a step with ``access="slots"`` or ``"try_once_discard"``."""
+    discrepancy: Literal["innovation", "held"] = "innovation"
+    """Discrepancy of ``"try_once_discard"``: of the new measurement against its expectation
+    (``"innovation"``) or the last delivered one (``"held"``)."""
+    discrepancy_weights: ArrayLike = 1.0
+    """Weights of the squared discrepancies: one number, or one per sensor."""
+    channels: int = 1
+    """Channels of ``access="collision"``."""
     tokens: Tokens = "limited"
     """``"limited"`` applies the token bucket. ``"unlimited"`` grants every request and counts the
     tokens spent."""
@@ -94,10 +107,14 @@ class CommonOptions:
     initial_channel: InitialState = "stationary"
     """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
     law."""
-    acknowledgements: Literal["perfect", "none"] | float = "perfect"
+    acknowledgements: Literal["perfect", "none"] | float | None = "perfect"
     """Whether a sensor learns that a packet arrives or is lost: always (``"perfect"``), never
     (``"none"``), or with a probability. Otherwise it supposes an arrival: its ``held`` and ``age``
     are of its last packet. The scheduler always knows."""
+    delay: ArrayLike = 0
+    """Steps from a transmission to its arrival, at most 100: a whole number, or a pair (least,
+    most) from which each packet draws uniformly. The fusion centre repeats its updates from the
+    time of a late packet on."""
     packet: Literal["measurement", "estimate"] = "measurement"
     """Content of a packet. ``"measurement"`` is the sensor's measurement or its node's estimate.
     ``"estimate"`` is the centralised scheduler's estimate with its covariance and needs
@@ -114,7 +131,8 @@ class CommonOptions:
     filter, or a better one where that filter minimises a bound."""
     belief_features: Sequence[Feature] | bool | None = None
     """Observation entries of the memory's estimate: ``"difference"`` from the fusion centre's
-    estimate and ``"value"`` of a transmission. ``True`` is both, the default with memory."""
+    estimate and ``"value"`` of a transmission. ``True`` is both, the default with memory. A delay
+    excludes the value."""
     horizon: int = 100
     """Steps of an episode. The open-loop error over the horizon scales reward and observation."""
     clock: bool = False
@@ -126,8 +144,8 @@ class CommonOptions:
     """Whether a local sensor observes its own number. ``False`` makes sensors of one kind
     indistinguishable to a shared policy."""
     action: Action = "binary"
-    """Action space: one bit u_m per sensor (``"binary"``), or the number Σ u_m 2^m
-    (``"discrete"``)."""
+    """Action space: one bit u_m per sensor, as ``MultiBinary`` (``"binary"``) or as
+    ``MultiDiscrete`` (``"multidiscrete"``), or the number Σ u_m 2^m (``"discrete"``)."""
     backend: Backend = "numpy"
     """Library that computes the steps. ``"jax"`` compiles the first step, in 1 to 20 seconds, and
     is then faster than ``"numpy"`` for few runs. It needs the extra ``jax``."""
@@ -144,8 +162,8 @@ class CommonOptions:
     uniformly in its logarithm."""
     price_range: ArrayLike | Literal["auto"] | None = None
     """Pair (low, high) of prices, which adds the price to the observation. ``"auto"`` simulates
-    rules: it takes the prices at which the best value of information with memory sends 60 and 12 %
-    of the sustained rate, but at least two packets per sensor and episode."""
+    rules without a delay: it takes the prices at which the best value of information with memory
+    sends 60 and 12 % of the sustained rate, but at least two packets per sensor and episode."""
     state_weights: ArrayLike | None = None
     """Weights of the states' squared errors in the reward. The default is the environment's own,
     which ``help`` shows. Explicit weights also weigh the trace that covariance intersection

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs, take_runs
+from fusion_gym.core.access import discrepancy, place_of
 from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Signals
@@ -35,7 +37,8 @@ class Outcome(NamedTuple):
         cost: Tokens spent (N,).
         requested: (sensors, N) bool.
         granted: (sensors, N) bool.
-        arrived: (sensors, N) bool, the granted packets that arrive at once.
+        arrived: (sensors, N) bool, whether a packet arrives before the next decision. A packet
+            without a delay counts in this step's error, a late one in the next step's.
         error: Truth minus fused estimate (n, N).
         squared_error: (n, N).
         diverged: (N,) bool, whether a squared error is not finite or exceeds the task's
@@ -189,6 +192,7 @@ class Runs:
         covariance = estimator.covariance(estimate)
         reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
         self._delivered = State(state.plant, estimate, network, supposed, history)
+        late = task.network.late(network)
         self.steps = self.steps + 1
         return Outcome(
             reward=reward_error + reward_communication,
@@ -197,7 +201,7 @@ class Runs:
             cost=spent,
             requested=requested,
             granted=delivery.granted,
-            arrived=arrived,
+            arrived=arrived if late is None else arrived | late.any(0),
             error=error,
             squared_error=squared_error,
             diverged=namespace(squared_error)
@@ -398,7 +402,16 @@ def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) ->
         for known in (state.estimate, state.supposed)
     )
     network = task.network.advance(state.network, noise[own:], steps)
+    network = rank_requests(task, network, estimate if supposed is None else supposed)
     return State(plant, estimate, network, supposed, state.history)
+
+
+def rank_requests(task: Task, state: NetworkState, known: Any) -> NetworkState:
+    """Return the network's state with the order of discrepancies, if the access rule needs it."""
+    if not task.network.rule.by_discrepancy:
+        return state
+    size = discrepancy(task.estimator.read(known), task.network.discrepancy)
+    return replace(state, place=place_of(task.network.weights * size, state.queue))
 
 
 def settle(task: Task, state: State) -> State:

@@ -15,9 +15,9 @@ import numpy as np
 from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.network import Network
 from fusion_gym.core.options import CommonOptions, Scenario, plain_options
 from fusion_gym.core.task import Task
-from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.errors import ConfigurationError, DivergenceError, display, forbidden
 
 Build = Callable[[Any], Scenario]
@@ -51,6 +51,7 @@ def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array 
     if _is_auto(options.price_range):
         rules = replace(
             options.nominal(),
+            delay=0,  # a late packet has no value of one step
             memory=True,
             error_weight=options.error_weight,
             state_weights=options.state_weights,
@@ -77,26 +78,30 @@ def rehearse(task: Task) -> None:
         ) from None
 
 
-def nominal_rate(bucket: TokenBucket, access: str) -> float:
+def nominal_rate(network: Network) -> float:
     """Return packets per sensor and step: half of the sustained rate, or a quarter if unlimited."""
-    return sustained_rate(bucket, access) / (4.0 if bucket.unlimited else 2.0)
+    return sustained_rate(network) / (4.0 if network.bucket.unlimited else 2.0)
 
 
-def sustained_rate(bucket: TokenBucket, access: str) -> float:
+def sustained_rate(network: Network) -> float:
     """Return the packets per sensor and step that the network sustains."""
-    most = 1.0 if access == "any" else 1.0 / len(bucket.cost)
+    bucket, rule, packets = network.bucket, network.rule, network.sensors
+    if rule.turn is not None or rule.limited:
+        packets = network.slots
+    elif rule.contended:
+        packets = min(network.channels, packets)
+    most = packets / network.sensors
     return most if bucket.unlimited else min(most, bucket.rate / float(bucket.cost.sum()))
 
 
 def sustained_tokens(task: Task) -> float:
     """Return the tokens per step that the network lets all sensors spend in the long run."""
-    bucket = task.network.bucket
-    return sustained_rate(bucket, task.network.access) * float(bucket.cost.sum())
+    return sustained_rate(task.network) * float(task.network.bucket.cost.sum())
 
 
 def nominal_error(task: Task) -> Array:
     """Return each state's mean squared error (n,) with requests at an even pace."""
-    rate, sensors = nominal_rate(task.network.bucket, task.network.access), task.sensors
+    rate, sensors = nominal_rate(task.network), task.sensors
     if rate == 0.0:
         return task.open_loop[:, 0]
     batch = _batch(task, _RUNS, 1)
@@ -192,7 +197,7 @@ def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
 
 def _stored(simulate: Callable[[Task], Any], options: CommonOptions, build: Build) -> Any:
     """Return the cached result of a simulation of options."""
-    key = simulate, build, json.dumps(plain_options(asdict(options)))
+    key = simulate, build, json.dumps(plain_options(asdict(options)), default=repr)
     if key not in _STORED:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

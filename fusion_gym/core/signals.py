@@ -5,6 +5,7 @@ from typing import Any
 
 from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.knowledge import Signal
+from fusion_gym.core.task import ONE_STEP
 
 # Knowledge in a task with memory; without memory "scheduler" and "own" suffice.
 MEMORY_SIGNALS = (
@@ -46,6 +47,9 @@ PLANNING_SIGNALS = (
     Signal("own_beliefs", "own_memory", "beliefs", "each sensor's belief of the state"),
 )
 
+# Signals of a packet that arrives at once, which a delay excludes.
+_AT_ONCE = ("transmission_value", "own_value", "variance_reduction", "greedy_variance")
+
 _OWN = ("own_beliefs", "own_difference", "own_value")
 _EVERY = ("beliefs", "belief_difference", "transmission_value")
 
@@ -59,10 +63,13 @@ def memory_signals(owner: Owner, beliefs: Callable[[], Beliefs]) -> Mapping[str,
     return dict(zip(_EVERY, values, strict=True))
 
 
-def missing_signals(owner: Owner) -> Mapping[str, str]:
-    """Return the names of another owner's signals, and the reason for their absence."""
+def missing_signals(owner: Owner, delayed: bool) -> Mapping[str, str]:
+    """Return the names of absent signals, and the reason for their absence."""
+    late = "is absent, because the network has a delay and"
+    hidden = {name: f"signal {name!r} {late} {ONE_STEP}" for name in _AT_ONCE if delayed}
     why = (
         "is absent, because this batch does not compute it: a policy that reads beliefs must "
         "declare the attribute memory_owner = 'scheduler' or 'own'"
     )
-    return {name: f"signal {name!r} {why}" for name in (_EVERY if owner == "own" else _OWN)}
+    absent = _EVERY if owner == "own" else _OWN
+    return {name: f"signal {name!r} {why}" for name in absent} | hidden

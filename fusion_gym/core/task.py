@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.access import ACCESS
 from fusion_gym.core.admission import admit
 from fusion_gym.core.channel import Channel
 from fusion_gym.core.communication import communication
@@ -45,6 +46,8 @@ _CHANNELS = {
 }
 _DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
 _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
+_LONGEST = 100  # steps of a delay
+ONE_STEP = "the value of a packet counts only an arrival in this step"  # excludes a delay
 _MOST_DISCRETE = 16  # sensors with a discrete action of 2^sensors values
 
 
@@ -60,8 +63,8 @@ class Task:
         horizon: Steps of an episode.
         information: Content of the observation: ``"sensors"`` (all new measurements) or
             ``"centre"`` (the fusion centre's knowledge before any transmission).
-        action: ``"binary"`` (one bit u_m per sensor) or ``"discrete"`` (the number Σ u_m 2^m). With
-            access ``"single"`` it is 0 for no request or m + 1 for sensor m.
+        action: ``"binary"`` or ``"multidiscrete"`` (one bit u_m per sensor), or ``"discrete"`` (the
+            number Σ u_m 2^m). With access ``"single"`` it is 0 for no request, m + 1 for sensor m.
         packet: Content of a packet: ``"measurement"`` or ``"estimate"``.
         broadcast: ``"none"``, ``"estimate"`` or ``"packets"`` (:mod:`fusion_gym.core.memory`).
         memory: Whether the scheduler or each local sensor has memory.
@@ -132,15 +135,22 @@ class Task:
                 f"action = 'discrete' is not allowed with {self.sensors} sensors: it numbers all "
                 f"sets of requests, so it allows at most {_MOST_DISCRETE} sensors"
             )
-        if len(self.network.delay) > 1 and self.packet == "estimate":
-            where = "with packet='estimate'"
-            raise validation.refusal("delay", self.network.delay, "none", where)
+        if self.packet == "estimate":
+            reason = "a late estimate cannot join what arrived before it"
+            self.refuse_delay(reason, "with packet='estimate'")
+        if self.estimator.reads_silence:
+            self.refuse_delay("a step without an arrival may be no silence", "with this filter")
+        if "value" in self.belief_features:
+            self.refuse_delay(ONE_STEP, "with belief_features='value'")
         states = len(self.plant.state_names)
         if self.reward.state_weights.shape != (states, 1):
             raise validation.ConfigurationError(
                 f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
                 f"plant has {states} states, so its shape must be ({states}, 1)"
             )
+        if self.network.rule.contended and self.estimator.reads_silence:
+            allowed = "without collisions, because a collision is no silence"
+            raise validation.refusal("access", "collision", allowed, "here")
         if self.network.acknowledgement < 1.0:
             self._check_acknowledgements()
         if self.backend == "jax":
@@ -183,16 +193,12 @@ class Task:
             weights,
             open_loop,
         )
-        how = communication(scenario)
+        network = make_network(options, plant.sensor_count)
+        how = communication(scenario, len(network.delay) > 1)
         return cls(
             plant=plant,
             estimator=scenario.estimator,
-            network=Network(
-                make_bucket(options, plant.sensor_count),
-                options.access,
-                make_channel(options, plant.sensor_count),
-                acknowledgement=acknowledgement(options.acknowledgements),
-            ),
+            network=network,
             reward=reward,
             horizon=horizon if limit is None else min(horizon, limit),
             information=options.information,
@@ -256,8 +262,8 @@ class Task:
 
     def _check_acknowledgements(self) -> None:
         """Refuse missing acknowledgements where the sensors learn of arrivals anyway."""
-        estimator, why = self.estimator, None
-        if not self.network.loses:
+        estimator, channel, why = self.estimator, self.network.channel, None
+        if not (self.network.rule.contended or (channel is not None and channel.loses)):
             why = "no packet is lost"
         elif self.broadcast != "none":
             why = f"broadcast={self.broadcast!r} acknowledges what arrives"
@@ -266,6 +272,19 @@ class Task:
         if why is not None:
             value = self.settings.get("acknowledgements")
             raise validation.refusal("acknowledgements", value, f"'perfect', because {why}", "here")
+
+    def refuse_delay(self, reason: str, where: str = "") -> None:
+        """Raise an error if the network delays packets.
+
+        Args:
+            reason: Reason of the refusal.
+            where: Setting that excludes a delay.
+
+        Raises:
+            ConfigurationError: The network delays packets.
+        """
+        if len(law := self.network.delay) > 1:
+            raise forbidden("delay", self.settings.get("delay") or law, reason, where)
 
     def _refuse_jax(self) -> None:
         """Refuse options that do not run under JAX."""
@@ -318,13 +337,41 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
     return bucket
 
 
-def acknowledgement(value: str | float) -> float:
+def make_network(options: CommonOptions, sensors: int) -> Network:
+    """Return the network of the options."""
+    rule = ACCESS[options.access]
+    for name, used in (
+        ("slots", rule.limited and options.access != "single"),
+        ("channels", rule.contended),
+        ("discrepancy", rule.by_discrepancy),
+        ("discrepancy_weights", rule.by_discrepancy),
+    ):
+        value, default = getattr(options, name), getattr(CommonOptions, name)
+        if not used and plain_options(value) != default:
+            raise forbidden(name, value, "it has no use", f"with access={options.access!r}")
+    for name in ("slots", "channels"):
+        validation.integer(name, getattr(options, name), at_least=1, at_most=sensors)
+    weights = validation.positive("discrepancy_weights", options.discrepancy_weights, (sensors,))
+    return Network(
+        make_bucket(options, sensors),
+        options.access,
+        make_channel(options, sensors),
+        make_delay(options),
+        acknowledgement=acknowledgement(options.acknowledgements),
+        slots=options.slots,
+        channels=options.channels,
+        discrepancy=options.discrepancy,
+        weights=weights[:, None],
+    )
+
+
+def acknowledgement(value: str | float | None) -> float:
     """Return the probability that the sender of a packet learns whether it arrives."""
     allowed = "'perfect', 'none' or a number from 0 to 1"
-    if isinstance(value, str):
-        if value not in (words := {"perfect": 1.0, "none": 0.0}):
+    if value is None or isinstance(value, str):
+        if (value or "none") not in (words := {"perfect": 1.0, "none": 0.0}):
             raise validation.refusal("acknowledgements", value, allowed)
-        return words[value]
+        return words[value or "none"]
     return validation.number("acknowledgements", value, at_least=0.0, at_most=1.0)
 
 
@@ -344,3 +391,19 @@ def make_channel(options: CommonOptions, sensors: int) -> Channel | None:
         return Channel.independent(drop, sensors, options.true_drop_probability)
     matrix = _TRANSITION if options.channel_transition is None else options.channel_transition
     return Channel.gilbert_elliott(matrix, drop, sensors, options.initial_channel)
+
+
+def make_delay(options: CommonOptions) -> tuple[float, ...]:
+    """Return the probabilities of a delay of 0, 1, … steps."""
+    value: Any = options.delay
+    pair = isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) > 0
+    ends = value if pair else (value, value)
+    if len(ends) == 2:
+        least, most = (
+            validation.integer("delay", end, at_least=0, at_most=_LONGEST) for end in ends
+        )
+        if least < most or not pair:
+            count = most + 1 - least
+            return (0.0,) * least + (1.0 / count,) * count
+    allowed = "a whole number, or a pair (least, most), least < most"
+    raise validation.refusal("delay", value, allowed)

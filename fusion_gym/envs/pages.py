@@ -14,7 +14,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import list_options, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
-from fusion_gym.envs.views import is_received, make_view
+from fusion_gym.envs.views import is_received, make_view, space_text
 
 LEGEND = """\
 A star marks entries that only the sensors know; `information="centre"` omits them. The third column
@@ -38,6 +38,7 @@ _SEES = {"own": "its own", "broadcast": "all", "hidden": "none"}
 _ACTIONS = {
     "single": "0 is no request, m requests sensor m - 1",
     "binary": "A 1 requests the sensor",
+    "multidiscrete": "A 1 requests the sensor",
     "discrete": "The number has a bit for each sensor, the lowest bit for sensor 0",
 }
 
@@ -65,7 +66,7 @@ def page(env_id: str, task: Task | None = None) -> str:
     weights = task.reward.state_weights[:, 0]
     return _PAGE.read_text(encoding="utf-8").format(
         description="\n\n".join(text for text in description if not re.match(r"v\d+: ", text)),
-        actions=view.actions,
+        actions=space_text(view.actions),
         action=_ACTIONS["single" if task.network.access == "single" else task.action],
         entries=len(view.names),
         sensors=task.sensors,

@@ -8,6 +8,7 @@ rows of a run), ``knowledge`` (class of a row), ``local`` (whether each row belo
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -22,14 +23,16 @@ from fusion_gym.errors import ConfigurationError, display, refusal
 
 Rows = NDArray[np.float32]
 Requests = NDArray[np.bool_]
+Actions = spaces.MultiBinary | spaces.MultiDiscrete | spaces.Discrete[Any]
 
 
 class SchedulerView:
     """One row per run: the task's observation, and a decision for all sensors.
 
-    The action space is ``MultiBinary(sensors)``. With ``action="discrete"`` it is
-    ``Discrete(2**sensors)`` for the number Σ u_m 2^m, and with ``access="single"`` it is
-    ``Discrete(sensors + 1)``: 0 is no request, m is sensor m - 1.
+    The action space is ``MultiBinary(sensors)``, with ``action="multidiscrete"``
+    ``MultiDiscrete([2] * sensors)``. With ``action="discrete"`` it is ``Discrete(2**sensors)`` for
+    the number Σ u_m 2^m, and with ``access="single"`` it is ``Discrete(sensors + 1)``: 0 is no
+    request, m is sensor m - 1.
     """
 
     rows_per_run, local = 1, False
@@ -41,11 +44,13 @@ class SchedulerView:
         self.names = layout.names
         self.space = spaces.Box(layout.low, layout.high, dtype=np.float32)
         self._sensors, self._single = task.sensors, task.network.access == "single"
-        self.actions: spaces.MultiBinary | spaces.Discrete[Any] = spaces.MultiBinary(task.sensors)
+        self.actions: Actions = spaces.MultiBinary(task.sensors)
         if self._single:
             self.actions = spaces.Discrete(task.sensors + 1)
         elif task.action == "discrete":
             self.actions = spaces.Discrete(2**task.sensors)
+        elif task.action == "multidiscrete":
+            self.actions = spaces.MultiDiscrete([2] * task.sensors)
 
     def rows(self, observation: Rows) -> Rows:
         """Return the observations unchanged."""
@@ -64,7 +69,7 @@ class SchedulerView:
         """
         shape = self.actions.shape or ()
         array = _numbers(actions, shape if runs is None else (runs, *shape))
-        if isinstance(self.actions, spaces.MultiBinary):
+        if not isinstance(self.actions, spaces.Discrete):
             requests = _bits(array)
             return np.ascontiguousarray((requests[None] if runs is None else requests).T)
         high = int(self.actions.n) - 1
@@ -74,8 +79,8 @@ class SchedulerView:
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """Return the allowed choices (N, choices) in the layout of sb3-contrib's MaskablePPO.
 
-        ``MultiBinary`` has two choices per sensor, silence and a request. ``Discrete`` has one
-        choice per number, which is allowed if all its requests are.
+        ``MultiBinary`` and ``MultiDiscrete`` have two choices per sensor, silence and a request.
+        ``Discrete`` has one choice per number, which is allowed if all its requests are.
 
         Args:
             allowed: (sensors, N), whether the sensor may request.
@@ -170,6 +175,12 @@ View = SchedulerView | SensorView
 def make_view(task: Task, local: bool = False) -> View:
     """Return the scheduler's view of a task, or the sensors' view with ``local``."""
     return SensorView(task) if local else SchedulerView(task)
+
+
+def space_text(space: spaces.Space[Any]) -> str:
+    """Return a space as Gymnasium writes it, in one line and with all its numbers."""
+    with np.printoptions(threshold=sys.maxsize, linewidth=sys.maxsize):
+        return str(space)
 
 
 def is_received(entry: ObservationEntry, broadcast: str) -> bool:

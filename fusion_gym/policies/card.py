@@ -26,7 +26,7 @@ from fusion_gym import validation
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
-from fusion_gym.envs.views import make_view
+from fusion_gym.envs.views import make_view, space_text
 from fusion_gym.policies.archive import NeedsTrust
 from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError, display
@@ -163,7 +163,11 @@ def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) ->
     if not names:
         return entries
     network = NetworkShape.of_weights(policy.state_dict())
-    plain = {"activation": names[0], "actions": str(model.action_space), "network": network.plain()}
+    plain = {
+        "activation": names[0],
+        "actions": space_text(model.action_space),
+        "network": network.plain(),
+    }
     return {"format": FORMAT} | entries | plain
 
 
@@ -201,8 +205,9 @@ def _inferred(data: Mapping[str, Any]) -> Blueprint:
         raise NeedsTrust(f"its activation is {value!r}")
     space = _table(data, "action_space")
     kind = re.sub(r".*\.(\w+)'>$", r"\1", str(space.get(":type:")))
-    start = "" if str(space.get("start", 0)) == "0" else f", start={space['start']}"
-    return Blueprint(algorithm, names[0], f"{kind}({space.get('n')}{start})")
+    start = f", start={space['start']}" if str(space.get("start", 0)).strip("[0 \n]") else ""
+    number = " ".join(str(space.get("n", space.get("nvec"))).split())
+    return Blueprint(algorithm, names[0], f"{kind}({number}{start})")
 
 
 def _entry(data: Mapping[str, Any]) -> Plain:

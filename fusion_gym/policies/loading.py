@@ -8,6 +8,7 @@ loader of Stable-Baselines3 loads the file and runs code that it contains.
 import dataclasses
 import pickle
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from fusion_gym import validation
 from fusion_gym.core.task import ACTION_KINDS, Task
-from fusion_gym.envs.views import View, make_view
+from fusion_gym.envs.views import View, make_view, space_text
 from fusion_gym.policies.archive import NeedsTrust, read_plain, read_weights
 from fusion_gym.policies.card import (
     ACTIVATIONS,
@@ -158,7 +159,7 @@ def _unpickled(
             problems.append(f"{name}: {error}")
             continue
         shape = model.observation_space.shape or ()
-        return model, _fitted(task, observed, shape, str(model.action_space))[0]
+        return model, _fitted(task, observed, shape, space_text(model.action_space))[0]
     raise ConfigurationError(f"it cannot be loaded as {'; '.join(problems)}")
 
 
@@ -195,11 +196,12 @@ def _fitted(
             f"{trained} shape {shape}, the task (information={task.information!r}) has "
             f"{view.space.shape}"
         )
-    allowed = {str(view.actions): (task.action, view)}
+    allowed = {space_text(view.actions): (task.action, view)}
     if not observed.local and task.network.access != "single":
-        for kind in set(ACTION_KINDS) - {task.action}:
-            other = make_view(dataclasses.replace(task, action=kind))
-            allowed[str(other.actions)] = (kind, other)
+        for kind in ACTION_KINDS:
+            with suppress(ConfigurationError):  # the kind "discrete" of many sensors
+                other = make_view(dataclasses.replace(task, action=kind))
+                allowed[space_text(other.actions)] = (kind, other)
     if actions not in allowed:
         raise ConfigurationError(
             f"it has the action space {actions!r}: the task has {task.sensors} sensors, so it must "

@@ -119,6 +119,12 @@ class ModelPolicy:
             rows = self.normalization.normalize_obs(rows)
         return rows
 
+    @property
+    def pairs(self) -> bool:
+        """Whether each bit of an action has two outputs of the network, silence and a request."""
+        multiple = isinstance(self.view.actions, spaces.MultiDiscrete)
+        return multiple or isinstance(self.model, MaskablePPO)
+
     def check_logits(self) -> None:
         """Refuse an agent without one logit for each sensor."""
         actions, model = self.view.actions, self.model
@@ -127,7 +133,7 @@ class ModelPolicy:
             raise refusal("policy", type(model).__name__, allowed)
         together = isinstance(actions, spaces.Discrete) and self.view.rows_per_run == 1
         if together and self.task.network.access != "single":
-            raise refusal("action", str(actions), "MultiBinary, or access='single'")
+            raise refusal("action", str(actions), "MultiBinary, MultiDiscrete, or access='single'")
 
     def logits(self, signals: Signals) -> Array:
         """Return the logit (sensors, N) of each sensor's request over its silence."""
@@ -154,4 +160,4 @@ class ModelPolicy:
         """Return the places of requests in the outputs of the network; the others are silence."""
         if isinstance(self.view.actions, spaces.Discrete):
             return slice(1, None)
-        return slice(1, None, 2) if isinstance(self.model, MaskablePPO) else slice(None)
+        return slice(1, None, 2) if self.pairs else slice(None)

@@ -14,7 +14,7 @@ from fusion_gym.core.knowledge import MEANING, Block, numbered
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import plain_options
 from fusion_gym.entries import Plain
-from fusion_gym.envs.views import SensorView
+from fusion_gym.envs.views import SensorView, space_text
 from fusion_gym.policies.card import algorithm_name
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes
@@ -57,7 +57,7 @@ def onnx_card(
         "observation_high": graph.high.tolist(),
         "observation_blocks": blocks,
         "action": {
-            "space": str(agent.view.actions),
+            "space": space_text(agent.view.actions),
             "sensors": task.sensors,
             "access": task.network.access,
             "choices": None if graph.choices is None else graph.choices.tolist(),

@@ -59,6 +59,7 @@ class DecisionGraph(torch.nn.Module):
         self._policy.eval()
         self._masked = isinstance(agent.model, MaskablePPO)
         self._recurrent = isinstance(agent.model, RecurrentPPO)
+        self._pairs = agent.pairs
         self._values = isinstance(policy, DQNPolicy)
         self._price = agent.price
         self._place = agent.view.names.index("price") if agent.price is not None else None
@@ -130,11 +131,12 @@ class DecisionGraph(torch.nn.Module):
                 closed = (1.0 - open_.to(logits.dtype)) @ self._table.T > 0.0
                 logits = torch.where(closed, torch.full_like(logits, _CLOSED), logits)
             return torch.softmax(logits, dim=1)
-        if open_ is None:
+        if not self._pairs:
             return torch.sigmoid(logits)
-        pairs = logits.reshape(-1, open_.shape[1], 2)
-        both = torch.stack((torch.ones_like(open_), open_), dim=2)
-        pairs = torch.where(both, pairs, torch.full_like(pairs, _CLOSED))
+        pairs = logits.reshape(-1, self._policy.action_net.out_features // 2, 2)
+        if open_ is not None:
+            both = torch.stack((torch.ones_like(open_), open_), dim=2)
+            pairs = torch.where(both, pairs, torch.full_like(pairs, _CLOSED))
         return torch.softmax(pairs, dim=2)[..., 1]
 
     def _taken(self, worth: torch.Tensor) -> torch.Tensor:
@@ -153,7 +155,7 @@ class DecisionGraph(torch.nn.Module):
 
 
 def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
-    """Return the requests (choices, k) int8 of each discrete action; None for binary actions."""
+    """Return the requests (choices, k) int8 of each discrete action; None for bits."""
     view = agent.view
     number = getattr(view.actions, "n", None)
     if len(view.actions.shape or ()) or number is None:

@@ -230,6 +230,7 @@ def _cycle(task: Task) -> int:
     if task.network.channel is not None and task.network.channel.loses:
         allowed = "'perfect', because the schedule supposes arrivals"
         raise validation.refusal("channel", task.settings["channel"], allowed)
+    task.refuse_delay("the schedule supposes arrivals in the step of a request")
     if estimator.covariance_cycle is None:
         raise ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(estimator).__name__}: its "

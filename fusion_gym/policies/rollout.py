@@ -11,7 +11,7 @@ from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.network import NetworkState
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import Branch, Position, State
+from fusion_gym.core.runs import Branch, Position, State, rank_requests
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, check_price, guard, owner_of
 from fusion_gym.policies.belief_rule import beliefs_of, check_owner, knows
@@ -33,6 +33,10 @@ class Imagination:
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self._task, self._memory, self._layout = task, memory, layout
+        if task.network.acknowledgement < 1.0:
+            why = "simulations do not have what the sensors suppose"
+            value = task.settings.get("acknowledgements")
+            raise validation.refusal("acknowledgements", value, f"'perfect', because {why}", "here")
         self._of_plant = task.plant.draw_channels
         if self._of_plant is None:
             raise ConfigurationError(
@@ -69,7 +73,7 @@ class Imagination:
         )
         if task.network.channel is not None and task.network.channel.states > 1:
             known.channel = signals["channel_state"][:, runs]
-        network = task.network.draw(known, rest_of_first)
+        network = rank_requests(task, task.network.draw(known, rest_of_first), estimate)
         state = State(plant, estimate, network)
         limit = np.full_like(steps, task.horizon)
         position = Position(state, signals["price"][runs], steps, limit)
@@ -165,6 +169,7 @@ class Rollout:
         if owner_of(self.base) == "own":
             allowed = "a scheduler's policy, because simulations begin with its belief"
             raise validation.refusal("base", base, allowed)
+        task.refuse_delay("simulations begin without the packets under way", "with this policy")
         memory = Memory(task, "scheduler")
         self._task, self.knowledge = task, knows(task, own=False)
         self._decision = guard(self.base, task)

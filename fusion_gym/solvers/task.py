@@ -55,6 +55,10 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
         ConfigurationError: another system, a drawn price, or a reward without the squared error.
     """
     system, channel, reward = _sources(task), task.network.channel, task.reward
+    task.refuse_delay("the optimum supposes arrivals in the step of a request")
+    if task.network.acknowledgement < 1.0:
+        value, allowed = task.settings.get("acknowledgements"), "'perfect'"
+        raise validation.refusal("acknowledgements", value, allowed, "for the optimum")
     if reward.error != "squared":
         raise validation.refusal("error", reward.error_kind, "'squared'", "for the optimum")
     if reward.price.fixed is None:

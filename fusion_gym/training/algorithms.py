@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
+from fusion_gym.core.task import ACTION_KINDS
 from fusion_gym.docstrings import table
 from fusion_gym.entries import Arguments
 from fusion_gym.importing import import_named
@@ -130,7 +131,7 @@ class Algorithm:
         meaning: its meaning, in a few words.
         source: paper or library.
         policy: kind of policy.
-        discrete_only: whether only Discrete actions are possible.
+        actions: possible kinds of action.
     """
 
     place: str
@@ -138,7 +139,7 @@ class Algorithm:
     meaning: str
     source: str
     policy: str = "MlpPolicy"
-    discrete_only: bool = False
+    actions: tuple[str, ...] = ACTION_KINDS
 
     @property
     def model(self) -> Any:
@@ -167,7 +168,7 @@ TABLE = {
     ),
     "dqn": Algorithm(
         f"{_SB3}DQN", DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602",
-        discrete_only=True,
+        actions=("discrete",),
     ),
     "maskable_ppo": Algorithm(
         f"{_MORE}MaskablePPO", PPOConfig, "PPO with a mask of the requests that the tokens deny",
@@ -179,7 +180,8 @@ TABLE = {
     ),
     "recurrent_ppo": Algorithm(
         f"{_MORE}RecurrentPPO", RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
-        "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy", discrete_only=True,
+        "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy",
+        actions=("multidiscrete", "discrete"),
     ),
 }  # fmt: skip
 
@@ -187,7 +189,7 @@ TABLE = {
 def algorithm_table(_: str) -> str:
     """Return the algorithms as a Markdown table."""
     rows = (
-        (f"`{name}`", row.meaning, "`Discrete`" if row.discrete_only else "all", row.source)
+        (f"`{name}`", row.meaning, ", ".join(f"`{kind}`" for kind in row.actions), row.source)
         for name, row in TABLE.items()
     )
     return table(("algorithm", "meaning", "actions", "source"), rows)

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium.spaces import MultiBinary
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
@@ -269,14 +269,15 @@ class Counterfactual(OnPolicyAlgorithm):
         return loss, parts
 
     def _logits(self, observation: torch.Tensor, masks: torch.Tensor | None) -> torch.Tensor:
-        """Return the logits of ``Discrete`` choices or of ``MultiBinary`` requests."""
+        """Return the logits of ``Discrete`` choices or of requests."""
         policy: Any = self.policy
         rows = policy.pi_features_extractor(observation.reshape(-1, observation.shape[-1]))
         logits: torch.Tensor = policy.action_net(policy.mlp_extractor.forward_actor(rows))
         logits = logits.reshape(*observation.shape[:-1], -1)
-        if masks is not None and self._decisions.binary:  # two a sensor, silence and a request
-            pairs = logits.reshape(len(logits), -1, 2)
-            logits, masks = pairs[..., 1] - pairs[..., 0], masks.reshape(pairs.shape)[..., 1]
+        if self._decisions.binary and logits.shape[-1] > self._decisions.sensors:
+            pairs = logits.reshape(len(logits), -1, 2)  # silence and a request
+            logits = pairs[..., 1] - pairs[..., 0]
+            masks = None if masks is None else masks.reshape(pairs.shape)[..., 1]
         return logits if masks is None else logits.masked_fill(~masks, _CLOSED)
 
     def _critic(self, observation: torch.Tensor) -> torch.Tensor:
@@ -367,7 +368,7 @@ class Decisions:
         self.view, self.local = env.view, isinstance(env.view, SensorView)
         self.sensors, self.runs = env.task.sensors, env.runs
         space = env.action_space
-        self.binary = isinstance(space, MultiBinary)
+        self.binary = not isinstance(space, Discrete)
         if self.local:
             self.kind: Kind = "flips"
         elif not self.binary:
@@ -403,7 +404,7 @@ class Decisions:
 
         Args:
             logits: for ``Discrete`` (runs, choices), for local decisions (runs, sensors, 2), for
-                the requests of ``MultiBinary`` (runs, sensors).
+                bits (runs, sensors).
         """
         if not self.binary:
             values = torch.log_softmax(logits, -1)

@@ -8,7 +8,7 @@ from typing import Any, TypedDict
 import numpy as np
 import torch
 import yaml
-from gymnasium.spaces import Discrete, MultiBinary
+from gymnasium.spaces import Discrete
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
@@ -49,9 +49,9 @@ from fusion_gym.validation import ConfigurationError, refusal
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     """Return the training environment."""
     name, local = experiment.algorithm.name, experiment.environment.local
-    many = not local and task.action != "discrete" and task.network.access != "single"
-    if TABLE[name].discrete_only and many:
-        reason = "set the environment's option action: discrete"
+    many = not local and task.network.access != "single"
+    if many and task.action not in TABLE[name].actions:
+        reason = f"set the environment's option action: {' or '.join(TABLE[name].actions)}"
         raise forbidden("action", task.action, reason, f"with algorithm {name!r}")
     training, where = experiment.training, experiment.environment
     runs: Arguments = {
@@ -111,12 +111,11 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
         rate: share of the steps with a request of a sensor.
 
     Returns:
-        Logits (sensors,) for ``MultiBinary``, or one per number of ``Discrete``.
+        Logits (sensors,) of the requests, or one per number of ``Discrete``.
     """
     odds, space, sensors = np.log(rate / (1.0 - rate)), env.action_space, env.task.sensors
-    if isinstance(space, MultiBinary):
+    if not isinstance(space, Discrete):
         return np.full(sensors, odds)
-    assert isinstance(space, Discrete)
     if isinstance(env.view, SensorView):
         return np.array([0.0, odds])
     if env.task.network.access == "single":
@@ -133,7 +132,7 @@ def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
     logits = initial_logits(env, rate)
     head = model.policy.action_net
     assert isinstance(head, torch.nn.Linear)
-    if head.out_features == 2 * logits.size:  # two choices a sensor, as MaskablePPO has them
+    if head.out_features == 2 * logits.size:  # two choices a sensor
         logits = np.stack((np.zeros_like(logits), logits), axis=1).ravel()
     with torch.no_grad():
         head.bias.add_(torch.as_tensor(logits, dtype=head.bias.dtype))

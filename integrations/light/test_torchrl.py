@@ -41,7 +41,7 @@ def test_the_page() -> None:
     assert names["local"]["sensor", "observation"].shape[:2] == (30, 3)
 
 
-@pytest.mark.parametrize("action", ["binary", "discrete"])
+@pytest.mark.parametrize("action", ["binary", "multidiscrete", "discrete"])
 @pytest.mark.parametrize("make", [GymEnv, lambda name, **o: GymWrapper(gym.make(name, **o))])
 def test_single_environments(make: Any, action: str) -> None:
     env = make(TOBIT, action=action, **OPTIONS)
@@ -50,7 +50,10 @@ def test_single_environments(make: Any, action: str) -> None:
     assert rollout["next", "done"].ravel().tolist() == ENDS
     assert rollout["next", "truncated"].ravel().tolist() == ENDS
     assert not rollout["next", "terminated"].any()
-    assert rollout["action"].shape == (12, {"binary": 3, "discrete": 8}[action])
+    shape = {"binary": (3,), "multidiscrete": (3, 2), "discrete": (8,)}[
+        action
+    ]  # one-hot but binary
+    assert rollout["action"].shape == (12, *shape)
     clocked = make(TOBIT, action=action, clock=True, **OPTIONS).rollout(5)
     assert clocked["next", "terminated"].ravel().tolist() == ENDS[:5]
 

@@ -61,7 +61,7 @@ def test_the_page() -> None:
 def test_a_worker_finds_the_environment_by_its_module() -> None:
     config = (
         PPOConfig()
-        .environment(NAME, env_config={**OPTIONS, "action": "discrete"})
+        .environment(NAME, env_config={**OPTIONS, "action": "multidiscrete"})
         .env_runners(num_env_runners=1, num_envs_per_env_runner=2)
         .training(**SMALL)
     )

@@ -44,7 +44,7 @@ COMMON: list[Options] = [
     {"access": "single", "error": "trace"},
     {"memory": True, "access": "any", "tokens": "limited", "sharing": "turns"} | SCARCE,
     {"access": "round_robin", "broadcast": "estimate", "belief_features": "value"},
-    {"access": "random", "error": "maximum", "error_weight": 2.0},
+    {"access": "random", "error": "maximum", "error_weight": 2.0, "action": "multidiscrete"},
 ]
 # Options of one environment.
 VARIANTS: dict[str, list[Options]] = {
@@ -120,17 +120,25 @@ VARIANTS: dict[str, list[Options]] = {
         LOSSY | {"memory": True, "true_transition": (0.8, 0.95)},
     ],
 }
-
-
 # Options of the network, beside those with recorded figures.
 NETWORKS: dict[str, list[Options]] = {
     "CorrelatedTracking": [
         {"channel": "gilbert_elliott", "acknowledgements": "none", "memory": True},
+        {"access": "try_once_discard", "discrepancy": "held"} | SCARCE,
+        {"delay": 2},
     ],
+    "LinearFusion": [
+        {"access": "collision", "channel": "independent", "memory": True},
+        {"delay": (0, 2), "memory": True, "channel": "independent"},
+    ],
+    "TobitOscillator": [{"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE],
     "MarkovJumpTracking": [{"channel": "independent", "acknowledgements": 0.4}],
     "UnknownInput": [{"channel": "independent", "acknowledgements": "none"} | SCARCE],
     "RemoteEstimation": [
         {"sensors": 2, "channel": "independent", "acknowledgements": 0.5, "memory": True},
+        {"sensors": 3, "access": "collision", "channels": 2},
+        {"sensors": 3, "access": "try_once_discard", "slots": 2},
+        LOSSY | {"delay": (1, 3), "information": "centre"},
     ],
 }
 
@@ -166,6 +174,11 @@ class Case:
         return not any(
             (name, self.options.get(name)) in central for name in ("information", "packet")
         )
+
+    @property
+    def local_memory(self) -> bool:
+        """Whether sensors may have beliefs of their own."""
+        return self.local and "delay" not in self.options
 
     def __str__(self) -> str:
         words = [f"{k}={v}" if isinstance(v, str) else k for k, v in self.options.items()]

@@ -28,7 +28,9 @@ from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError
 
 COMMON_CASES = [
-    case for case in CASES if not set(case.options) - {"information", "access", "clock", "error"}
+    case
+    for case in CASES
+    if not set(case.options) - {"information", "access", "clock", "error", "action", "error_weight"}
 ]
 each_case = pytest.mark.parametrize("case", COMMON_CASES, ids=str)
 each_default = pytest.mark.parametrize("case", [c for c in CASES if not c.options], ids=str)
@@ -61,8 +63,8 @@ def test_pettingzoos_checks(env_id: str) -> None:
 
 @each_case
 def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
-    if not case.local:
-        with pytest.raises(ConfigurationError, match="information = 'centre'"):
+    if not (case.local_memory if case.task().memory else case.local):
+        with pytest.raises(ConfigurationError, match=r"(information = 'centre'|delay = )"):
             fusion_gym.parallel_env(case.env_id, **case.options)
         return
     env, task = fusion_gym.parallel_env(case.env_id, **case.options), case.task()
@@ -87,8 +89,8 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
 
 @each_case
 def test_sensors_rows_of_stable_baselines_are_the_schedulers_runs(case: Case) -> None:
-    if not case.local:
-        with pytest.raises(ConfigurationError, match="information = 'centre'"):
+    if not (case.local_memory if case.task().memory else case.local):
+        with pytest.raises(ConfigurationError, match=r"(information = 'centre'|delay = )"):
             fusion_gym.make_sb3_vec_env(case.env_id, 3, local=True, **case.options)
         return
     options = case.options | {"horizon": 5}

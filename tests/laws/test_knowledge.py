@@ -99,7 +99,7 @@ def shown(batch: EpisodeBatch, outcome: Outcome | None) -> dict[str, Any]:
 @each_case
 def test_nothing_shown_depends_on_the_truth(case: Case, owner: Any) -> None:
     """Neither states of estimators, signals, observation nor infos, behind equal measurements."""
-    if owner == "own" and not case.local:
+    if owner == "own" and not case.local_memory:
         return
     task = case.task(**FREE)
     other = dataclasses.replace(task, plant=OtherTruth(task.plant), backend="numpy")
@@ -142,8 +142,8 @@ def test_the_centre_is_shown_nothing_of_the_sensors(env_id: str) -> None:
 def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
     """Groups of runs on one noise, but for one normal each that reaches the measurements of one
     sensor alone. That sensor sends nothing: neither the centre nor another sensor notices."""
-    batch = case.batch(1, owner="own" if case.local else None, **FREE)
-    task, view = batch.task, SensorView(batch.task) if case.local else None
+    batch = case.batch(1, owner="own" if case.local_memory else None, **FREE)
+    task, view = batch.task, SensorView(batch.task) if case.local_memory else None
     channels = np.arange(task.plant.noise_channels)
     reached = np.zeros((task.sensors, len(channels)), dtype=np.bool_)
     for signals, _ in steps(batch, np.append(-1, channels), np.zeros((STEPS, task.sensors, 1))):
@@ -223,12 +223,13 @@ def check_greedy(greedy: Array, trace: Callable[..., Array]) -> None:
 
 
 def deterministic_variance(case: Case) -> bool:
-    """Whether covariances do not depend on what is measured, lost, or was fused before."""
+    """Whether covariances do not depend on what is measured, lost, late, or was fused before."""
     settings = case.task().settings
     return (
         "Biased" not in case.env_id
         and settings.get("filter") not in ("adf", "imm", "truncated")
         and settings.get("channel", "perfect") == "perfect"
+        and not settings["delay"]
         and not ("UnknownInput" in case.env_id and settings["fusion"] == "ci")
     )
 

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cases import IDS, SCARCE, Case, each_case, each_id, read, requests, short
+from cases import IDS, SCARCE, Case, Options, each_case, each_id, read, requests, short
 
 import fusion_gym
-from fusion_gym.core.access import ACCESS_RULES
+from fusion_gym.core.access import ACCESS
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -51,7 +51,7 @@ def test_grantable_is_what_the_network_grants_alone(case: Case) -> None:
             batch.step(request)
 
 
-@pytest.mark.parametrize("access", ACCESS_RULES)
+@pytest.mark.parametrize("access", ACCESS)
 @each_id
 def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
     """With tokens without end, exactly those that are admitted and ask."""
@@ -62,7 +62,7 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
         available = task.plant.available(batch.state.plant)
         sampled = True if available is None else available[0]
         granted = batch.step(target).granted
-        if access == "single":
+        if ACCESS[access].limited:
             np.testing.assert_array_equal(granted.sum(0), (target & sampled).any(0))
             assert not (granted & ~target).any()
             continue
@@ -74,7 +74,7 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
         if access == "round_robin":
             assert (admitted == (np.arange(task.sensors) == step % task.sensors)[:, None]).all()
         else:
-            assert (admitted.sum(0) == (task.sensors if access == "any" else 1)).all()
+            assert (admitted.sum(0) == (1 if ACCESS[access].turn else task.sensors)).all()
     if access == "random" and available is None:
         mean = turns.sum() / task.sensors
         assert (np.abs(turns - mean) < 4.0 * np.sqrt(mean) * (task.sensors > 1) + 1e-9).all()
@@ -147,20 +147,22 @@ def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
 @each_case
 def test_a_delivery_begins_age_and_held_value_anew(case: Case) -> None:
     """And nothing else does. A packet may be lost, or hold nothing where nothing is sampled."""
+    if "delay" in case.options:
+        return
     batch = case.batch()
-    loses, arrived = batch.arrival_probability() is not None, 0
+    deliveries = 0
     for request in requests(batch.task, 3, STEPS):
         before = read(batch)
         age, new, held = (np.copy(before[name]) for name in ("age", "measurement", "held"))
-        granted = batch.step(request).granted
+        arrived = batch.step(request).arrived
         after = read(batch)
-        fresh = granted & (after["age"] == 1)
-        assert loses or fresh[granted & before.get("sampled", True)].all()
+        fresh = arrived & (after["age"] == 1)
+        assert fresh[arrived & before.get("sampled", True)].all()
         assert (after["age"][~fresh] == age[~fresh] + 1).all()
         sent = np.broadcast_to(fresh[:, None], held.shape)
         np.testing.assert_array_equal(after["held"], np.where(sent, new, held))
-        arrived += int(fresh.sum())
-    assert arrived
+        deliveries += int(fresh.sum())
+    assert deliveries
 
 
 @each_id
@@ -186,6 +188,40 @@ def test_an_estimate_is_adopted_where_a_packet_arrives(env_id: str) -> None:
         denied += int((request.any(0) & ~granted).sum())
     assert denied
     assert adopted
+
+
+UNCERTAIN: list[Options] = [
+    {"channel": "independent", "true_drop_probability": (0.1, 0.9)},
+    {"channel": "gilbert_elliott"},
+    {"access": "collision", "channels": 2},
+    {"delay": (0, 3)},
+]
+
+
+@pytest.mark.parametrize("options", UNCERTAIN, ids=lambda options: next(iter(options)))
+@each_id
+def test_nothing_shown_knows_what_becomes_of_the_next_packet(env_id: str, options: Options) -> None:
+    """Neither its loss, its delay, its channel nor the true probability of a loss."""
+    more: Options = THREE.get(short(env_id), {}) if "channels" in options else {}
+    if "channels" in options and "RandomWalk" in env_id:  # one sensor has one channel
+        return
+    task = fusion_gym.make_task(env_id, tokens="unlimited", **options | more)
+    batch = EpisodeBatch.seeded(task, 60, 0)
+    for request in requests(task, 60, 4):
+        batch.step(request)
+    branch, everyone = batch.branch(), np.ones((task.sensors, 60), dtype=np.bool_)
+    noise = np.random.default_rng(1).standard_normal((task.network.draw_channels, 60))
+    network = dataclasses.replace(branch.state.network)
+    if network.true_drop is not None:
+        network.true_drop = 1.0 - network.true_drop
+    branch.state = branch.state._replace(network=task.network.draw(network, noise))
+    assert set(batch.signals()) == set(branch.signals())
+    for name in set(batch.signals()) - {"beliefs", "estimate", "observation"}:
+        np.testing.assert_array_equal(batch.signals()[name], branch.signals()[name], err_msg=name)
+    np.testing.assert_array_equal(batch.observe(), branch.observe())
+    np.testing.assert_array_equal(batch.grantable(), branch.grantable())
+    fates = [runs.deliver(everyone).arrived for runs in (batch, branch)]
+    assert (fates[0] != fates[1]).any()
 
 
 def test_every_environment_is_under_the_laws() -> None:

@@ -256,9 +256,9 @@ class StochasticEventFilter(KalmanFilter):
     federated fusion several nodes together give the exact posterior for every mixture of deliveries
     and silences, because z refers to the centre's prediction, which all nodes share.
 
-    The filter is exact if the policy is ``stochastic_event`` with this weight, every request is
-    granted and the sensors are uncensored. After a denial, under censoring or with a policy that
-    transmits less, the claimed covariance is too small.
+    The filter is exact if the policy is ``stochastic_event`` with this weight, every request
+    arrives at once and the sensors are uncensored. After a denial or a loss, under censoring or
+    with a policy that transmits less, the claimed covariance is too small.
 
     ``weight`` has shape (sensors, 1), in the inverse squared unit of the measurement, >= 0; with
     weight 0 silence carries no information.
@@ -277,7 +277,7 @@ class StochasticEventFilter(KalmanFilter):
         Z = w I is the weight of the policy ``stochastic_event`` (``stochastic_weight``).
 
     Assumes: a linear plant, Gaussian noises, uncensored sensors, the policy
-    ``stochastic_event`` with the same weight, and that every request is granted.
+    ``stochastic_event`` with the same weight, and that every request arrives at once.
 
     Source: D. Han, Y. Mo, J. Wu, S. Weerakkody, B. Sinopoli and L. Shi, "Stochastic
     event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control

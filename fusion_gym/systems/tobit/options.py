@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, plain_options
-from fusion_gym.errors import forbidden
+from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.centre import (
@@ -124,6 +124,8 @@ def feedback_scenario(
         belongs = "a filter with nodes (here the centre uses the measurements)"
         _refuse(options, _OF_FUSION, where, belongs)
     centre = filters[kind].make(options, sensors)
+    if centre.reads_silence and options.channel != "perfect":
+        raise refusal("channel", options.channel, "'perfect', because a loss is no silence", where)
     absent = ("true_threshold_shift",) if sensors.unlimited else ()
     nature = Nature.create(options, (*plant.unmoved, *absent))
     nature.check_growth(plant.true_radius, options.horizon)
