@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from gymnasium import spaces
 
+from fusion_gym.core.access import channel_requests
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
@@ -113,9 +114,9 @@ class FunctionalEnv:
 
     @property
     def num_actions(self) -> int:
-        """Number of actions of a ``Discrete`` space, or of bits."""
+        """Number of actions of a ``Discrete`` space, or of bits or channels."""
         space = self._view.actions
-        return int(space.n) if isinstance(space, spaces.Discrete) else self.task.sensors
+        return int(space.n) if isinstance(space, spaces.Discrete) else int(space.shape[0])
 
     def action_space(self, params: EnvParams | None = None) -> Any:
         """Return the action space."""
@@ -252,7 +253,7 @@ class FunctionalEnv:
         return self._runs(self._task(params), state).signals()
 
     def requests(self, action: Any) -> Any:
-        """Return the requests (sensors, 1) bool of an action.
+        """Return the requests (sensors, 1) bool of an action, or the channels of an assignment.
 
         Args:
             action: Action of :meth:`action_space`.
@@ -263,6 +264,8 @@ class FunctionalEnv:
         action, shape = jnp.asarray(action), self._view.actions.shape
         if action.shape != shape:
             raise ValueError(f"action of shape {action.shape} is not allowed: it must be {shape}")
+        if self.task.action == "assignment":
+            return channel_requests(action[:, None], self.task.sensors)
         if not isinstance(self._view.actions, spaces.Discrete):
             return action.reshape(-1, 1).astype(np.bool_)
         sensors = jnp.arange(self.task.sensors)[:, None]

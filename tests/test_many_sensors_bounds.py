@@ -11,7 +11,7 @@ from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.solvers import solve_ages, solve_task
+from fusion_gym.solvers import AgeSource, solve_ages, solve_task
 from fusion_gym.solvers.source import TokenLevels
 from fusion_gym.solvers.task import source_problems
 from fusion_gym.training.counterfactual import Decisions
@@ -68,7 +68,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
         lambda: TokenLevels.create(TokenBucket.create(1.0, 13.0, 1.0, 1.0, sensors=13)),
         r"sensors = 13 .*at most 12.*2\^13",
     ),
-    "ages": (lambda: solve_ages(source_problems(sources(60)), longest=1), r"60 sources.*2\^60"),
+    "ages": (
+        lambda: solve_ages(tuple(AgeSource.of_scalar(p, 1) for p in source_problems(sources(60)))),
+        r"60 sources.*2\^60",
+    ),
     "sensors": (lambda: sources(1001), r"sensors = 1001.*<= 1000"),
 }
 

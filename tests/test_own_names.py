@@ -220,7 +220,7 @@ def test_a_variant_is_its_environment_with_the_options_of_its_registration(own: 
         vector: Any = gym.make_vec(name, 2, token_rate=3.0)
         assert single.spec.max_episode_steps == vector.task.horizon == 7
         assert single.unwrapped.task.settings == vector.task.settings == expected.settings
-        assert "token_rate: float = 3  (default: " in single.unwrapped.spec.pprint(True)
+        assert "token_rate: ArrayLike = 3  (default: " in single.unwrapped.spec.pprint(True)
         tasks = [
             fusion_gym.make_task(name, token_rate=3.0),
             fusion_gym.make_sb3_vec_env(name, 2, token_rate=3.0).task,

@@ -47,6 +47,10 @@ ENVIRONMENTS: dict[str, tuple[str, Values]] = {
         "RemoteEstimation-v1",
         {"sensors": 2, "cost_weight": 3.0, "channel": "gilbert_elliott"},
     ),
+    "vectors": (
+        "RemoteEstimation-v1",
+        {"sources": (2, 0), "access": "slots", "channel": "gilbert_elliott"},
+    ),
     "remote, one link": (
         "RemoteEstimation-v1",
         {"sensors": 2, "cost_weight": 0.3, "access": "single", "noise_deviation": (1.0, 1.5)},
@@ -85,6 +89,8 @@ POLICIES: dict[str, list[str]] = {
         "threshold=0.5,at_most=1",
         "threshold=0.3,whitened=true,at_most=2",
     ],
+    "age_index": ["price=30", "price=30,at_most=none"],
+    "age_optimum": ["longest=20"],
     "kullback_leibler": ["threshold=0.3,at_most=1", "threshold=0.3,own=true"],
     "local_variance": ["", "m=0.3"],
     "model": [f"{zoo.model_path('tobit_oscillator_centre')}"],

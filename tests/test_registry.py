@@ -59,7 +59,7 @@ def test_a_policy_of_ones_own_is_in_every_list(task: Task) -> None:
     results = fusion_gym.evaluation.run_episodes(task, policy, 4, 0)
     assert 0.0 < results.requests.mean() < 1.0
     for text, message in (
-        ("mien", r"unknown policy 'mien': did you mean 'mine'\? .*local_variance, mine, model"),
+        ("mien", r"unknown policy 'mien': did you mean 'mine'\? .*maximum_age, mine, model"),
         ("mine:treshold=1", r"unknown parameter of policy 'mine' 'treshold': .* 'threshold'"),
     ):
         with pytest.raises(ConfigurationError, match=message):

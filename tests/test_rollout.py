@@ -145,7 +145,7 @@ def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
         apart = np.abs(truth.mean(-1) - best.mean[0]) / deviation
         assert (apart < 1.0).all()
     if name == "remote":
-        arrives = task.network.arrival_probability(state.network)
+        arrives = task.network.link_probability(state.network)[:, 0]
         lost = state.network.lost.reshape(-1, 2, count).mean(-1)
         np.testing.assert_allclose(1.0 - lost, arrives[:, [0, count]], atol=0.03)
     if task.memory_estimator is not None:

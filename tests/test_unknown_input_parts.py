@@ -271,6 +271,7 @@ def signals(measurement: Array, held: Array, start: bool) -> Signals:
             "measurement": measurement,
             "held": held,
             "start": np.full(runs, start),
+            "step": np.zeros(runs),
             "tokens": np.zeros(runs),
             "token_cost": np.ones((sensors, 1)),
         }

@@ -196,7 +196,7 @@ def mistakes(task: Task, policy: Policy) -> None:
     run_episodes(task, policy, "many", 0)  # type: ignore[arg-type]
     run_episodes(policy, task, 3, 0)  # type: ignore[arg-type]
     LinearFusionOptions(token_rat=2.0)  # type: ignore[call-arg]
-    LinearFusionOptions(token_rate="two")  # type: ignore[arg-type]
+    LinearFusionOptions(error_weight="two")  # type: ignore[arg-type]
     print(run_episodes(task, policy, 3, 0).mean_squared_error)  # type: ignore[attr-defined]
     run_episodes(task, lambda signals: signals, 3, 0)  # type: ignore[arg-type]
     print(fusion_gym.evaluation.run_episode)  # type: ignore[attr-defined]

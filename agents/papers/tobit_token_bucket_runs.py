@@ -76,11 +76,11 @@ def scheme(**options: Any) -> Task:
 
 def single_sensor(sensor: int) -> Task:
     """Return the task of a single sensor: its third of the bucket and no feedback."""
-    options, trigger = TobitOscillatorOptions(), DynamicEvent()
+    bucket, trigger = scheme().network.bucket, DynamicEvent()
     return scheme(
-        measurement_matrices=(np.eye(2).tolist(),), token_rate=options.token_rate / SENSORS,
-        token_capacity=options.token_capacity / SENSORS,
-        initial_tokens=options.initial_tokens / SENSORS,
+        measurement_matrices=(np.eye(2).tolist(),), token_rate=bucket.rate / SENSORS,
+        token_capacity=bucket.capacity / SENSORS,
+        initial_tokens=bucket.initial / SENSORS,
         trigger_threshold=trigger.column("threshold", SENSORS)[sensor],
         trigger_decay=trigger.column("decay", SENSORS)[sensor],
     )  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.errors import refusal
 from fusion_gym.namespace import namespace, ndtr, ranked_sum
 
 Requests = NDArray[np.bool_]
@@ -29,6 +32,7 @@ class AccessRow:
         by_discrepancy: Whether the requests of the largest discrepancies are granted, instead of
             the first in the queue.
         contended: Whether two packets on one of ``channels`` destroy each other.
+        by_channel: Whether each granted request has one of ``slots`` channels of its own.
     """
 
     meaning: str
@@ -37,6 +41,7 @@ class AccessRow:
     limited: bool = False
     by_discrepancy: bool = False
     contended: bool = False
+    by_channel: bool = False
 
 
 def _lottery(sensors: int, step: NDArray[np.int64], noise: Array) -> NDArray[np.int64]:
@@ -67,11 +72,34 @@ ACCESS: dict[str, AccessRow] = {
         "Communication Review 5, 1975).",
         contended=True,
     ),
+    "assignment": AccessRow(
+        "At most ``channels`` requests are granted, each on a channel of its own: in the order of "
+        "the queue each takes the free one of the highest probability of arrival, or the one that "
+        "the action assigns.",
+        limited=True,
+        by_channel=True,
+    ),
 }
 
 
-def first_requests(requests: Requests, place: NDArray[np.int64], slots: int = 1) -> Requests:
-    """Return at most ``slots`` of the requests (sensors, N), from the sensors of lowest place."""
+def check_requests(requests: NDArray[Any], channels: int) -> None:
+    """Check that requests are bool or numbers of channels, 0 for silence; JAX checks nothing."""
+    if requests.dtype == np.bool_ or not isinstance(requests, np.ndarray):
+        return
+    if requests.dtype.kind not in "iu" or not np.all((requests >= 0) & (requests <= channels)):
+        allowed = f"bool, or with access='assignment' channels from 1 to {channels} and 0"
+        allowed = allowed if channels else "bool, because this access assigns no channels"
+        raise refusal("requests", requests, allowed)
+
+
+def first_requests(requests: NDArray[Any], place: NDArray[np.int64], slots: int = 1) -> Requests:
+    """Return at most ``slots`` of the requests (sensors, N), from the sensors of lowest place.
+
+    Of requests that are numbers of channels it is one on each.
+    """
+    if requests.dtype != np.bool_:
+        each = (first_requests(requests == channel, place) for channel in range(1, slots + 1))
+        return functools.reduce(operator.or_, each)
     if slots > 1:
         return requests & (ranked_sum(requests * 1, place) <= slots)
     waiting = namespace(requests, place).where(requests, place, len(requests))
@@ -98,6 +126,40 @@ def place_of(size: Array, queue: NDArray[np.int64]) -> NDArray[np.int64]:
     xp = namespace(size, queue)
     place: NDArray[np.int64] = xp.argsort(xp.lexsort((queue, -size), axis=0), axis=0)
     return place
+
+
+def assign(granted: Requests, place: NDArray[np.int64], probability: Array) -> NDArray[np.int64]:
+    """Return the channels (sensors, N) of granted requests, 0 without one.
+
+    In the order of places each takes the free channel of the highest probability of arrival.
+
+    Args:
+        granted: (sensors, N), at most one for each channel.
+        place: Places (sensors, N) of the sensors, a permutation.
+        probability: Probability of an arrival (sensors, channels, N).
+    """
+    xp, channels = namespace(granted, probability), probability.shape[1]
+    rank, numbers = ranked_sum(granted * 1, place), np.arange(channels)[:, None]
+    result, free = granted * 0, xp.ones(probability.shape[1:], dtype=np.bool_)
+    for turn in range(1, channels + 1):
+        own = granted & (rank == turn)
+        chance = xp.where(own[:, None], probability, 0.0).sum(0)
+        best = xp.where(free, chance, -1.0).argmax(0)
+        result = xp.where(own, best + 1, result)
+        free = free & ((numbers != best) | ~own.any(0))
+    return result
+
+
+def channel_requests(assignment: NDArray[Any], sensors: int) -> NDArray[np.int64]:
+    """Return the channel (…, sensors, N) of each sensor, its first of several, or 0.
+
+    Args:
+        assignment: Number (…, channels, N) of the sensor of each channel from 1, or 0 for nobody.
+        sensors: Number of sensors.
+    """
+    own = assignment[..., None, :, :] == np.arange(1, sensors + 1)[:, None, None]
+    result: NDArray[np.int64] = namespace(own).where(own.any(-2), own.argmax(-2) + 1, 0)
+    return result
 
 
 def collisions(granted: Requests, frequency: NDArray[np.int64] | int, channels: int) -> Requests:

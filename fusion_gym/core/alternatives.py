@@ -1,6 +1,6 @@
 """The outcomes of a step for alternative requests on the same noise."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ class Alternatives(NamedTuple):
 
 def alternatives(
     before: Branch,
-    requests: NDArray[np.bool_],
+    requests: NDArray[Any],
     noise: Array,
     taken: Outcome,
     observation: NDArray[np.float32],
@@ -40,7 +40,7 @@ def alternatives(
 
     Args:
         before: Runs before the step; they remain unchanged.
-        requests: (A, sensors, N), the alternatives.
+        requests: (A, sensors, N), the alternatives, bool or channels of an assignment.
         noise: Standard normals (channels, N) of the step.
         taken: Outcome of the step with the actual requests.
         observation: Observations (N, entries) after that step.
@@ -49,13 +49,16 @@ def alternatives(
     """
     many, sensors, runs = requests.shape
     values = np.tile(np.arange(runs), many)  # columns of results, the taken step first
-    granted = before.answer(requests.transpose(1, 0, 2).reshape(sensors, -1), values).granted
+    each = requests.transpose(1, 0, 2).reshape(sensors, -1)
+    granted, base = before.answer(each, values).granted, 2
     other = np.flatnonzero((granted != np.tile(taken.granted, many)).any(0))
+    if each.dtype != np.bool_:  # channels, which the outcome does not have
+        granted, base, other = granted * each, before.task.network.slots + 1, np.arange(values.size)
     error, communication = taken.error, taken.reward_communication
     if other.size:
         first = np.arange(other.size)
-        if sensors + runs.bit_length() <= _MOST_BITS:
-            codes = (1 << np.arange(sensors)) @ granted[:, other] * runs + other % runs
+        if sensors * (base - 1).bit_length() + runs.bit_length() <= _MOST_BITS:
+            codes = base ** np.arange(sensors) @ granted[:, other] * runs + other % runs
             _, first, place = np.unique(codes, return_index=True, return_inverse=True)
             values[other] = runs + place
         else:

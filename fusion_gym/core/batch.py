@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array, merge_runs
+from fusion_gym.core.access import check_requests
 from fusion_gym.core.admission import require_finite
 from fusion_gym.core.beliefs import Owner
 from fusion_gym.core.estimator import Estimator, Reception
@@ -163,13 +164,14 @@ class EpisodeBatch(Runs):
             state = state._replace(history=(last,) * (len(task.network.delay) - 1))
         self.state = state if everyone else merge_runs(self.state, state, runs)
 
-    def step(self, requests: NDArray[np.bool_]) -> Outcome:
+    def step(self, requests: NDArray[Any]) -> Outcome:
         """Grant requests, update, fuse and reward; then move the plant and sense.
 
         Finished runs continue without meaning until they are reset.
 
         Args:
-            requests: (sensors, N) bool.
+            requests: (sensors, N) bool, or with ``access="assignment"`` the channel from 1 of each
+                packet, 0 for none; a channel that two ask for goes to the first in the queue.
 
         Raises:
             RuntimeError: The batch was never reset.
@@ -234,8 +236,10 @@ class EpisodeBatch(Runs):
             raise refusal("backend", "jax", "'numpy' with memory or the beliefs of local sensors")
         return CompiledStep(self.task, Memory(self.task, self.memory.owner), self.layout)
 
-    def _run_program(self, requests: NDArray[np.bool_]) -> Outcome:
+    def _run_program(self, requests: NDArray[Any]) -> Outcome:
         """Make both halves of a step under JAX."""
+        rule, slots = self.task.network.rule, self.task.network.slots
+        check_requests(requests, slots * rule.by_channel)
         program, before = self._program, self._state
         assert program is not None
         if before is not self._computed or not self._rows:

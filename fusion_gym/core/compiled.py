@@ -104,7 +104,7 @@ class CompiledStep:
         return self._position.pack(np, position)
 
     def __call__(
-        self, rows: list[Any], requests: NDArray[np.bool_], noise: Array
+        self, rows: list[Any], requests: NDArray[Any], noise: Array
     ) -> tuple[list[Any], Result]:
         """Return the rows and the results after a step."""
         rows, result = self._program(rows, requests, noise)

@@ -8,9 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import validation
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.access import ACCESS, AccessRow, collisions, first_requests
+from fusion_gym.core.access import (
+    ACCESS,
+    AccessRow,
+    assign,
+    check_requests,
+    collisions,
+    first_requests,
+)
 from fusion_gym.core.channel import Channel
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.token_bucket import Grants, Queue, TokenBucket
@@ -22,14 +29,16 @@ from fusion_gym.namespace import namespace, ndtr
 class NetworkState:
     """The network of N runs before the requests of a step; l sensors, delays of at most D steps.
 
-    ``tokens`` (N,) · ``queue`` (l, N), the place of each sensor · ``admitted`` (l, N) bool, by the
-    access rule · ``channel`` (l, N), the channels' state at the step before, which is fed back ·
-    ``place`` (l, N), 0 for the largest discrepancy. Hidden are ``following`` (l, N), the channels'
-    present state, ``lost`` (l, N) bool, whether a packet sent now is lost, ``frequency`` (l, N),
-    its channel, ``delay`` (l, N), its delay in steps, ``due`` (D, l, N), the delay of the packet
-    that was sent 1, …, D steps ago, 0 without one, ``true_drop`` (N,), the true probability of a
-    loss, and ``unreported`` (l, N) bool, whether the sender of a packet does not learn if it
-    arrives. ``None`` is absent.
+    ``tokens`` (N,), or (l, N) of each sensor's own bucket · ``queue`` (l, N), the place of each
+    sensor · ``admitted`` (l, N) bool, by the access rule · ``channel`` (l, N), the channels' state
+    at the step before, which is fed back · ``place`` (l, N), 0 for the largest discrepancy. Hidden
+    are ``following`` (l, N), the channels' present state, ``lost`` (l, N) bool, whether a packet
+    sent now is lost, ``frequency`` (l, N), its channel, ``delay`` (l, N), its delay in steps,
+    ``due`` (D, l, N), the delay of the packet that was sent 1, …, D steps ago, 0 without one,
+    ``true_drop`` (N,), the true probability of a loss, ``unreported`` (l, N) bool, whether the
+    sender of a packet does not learn if it arrives, and ``harvest`` (l, N) bool, the tokens that
+    the sensors gain. With k channels for an assignment ``channel``, ``following`` and ``lost`` have
+    l·k rows, k adjacent ones for each sensor. ``None`` is absent.
     """
 
     tokens: Array
@@ -44,6 +53,18 @@ class NetworkState:
     unreported: NDArray[np.bool_] | None = None
     place: NDArray[np.int64] | None = None
     frequency: NDArray[np.int64] | None = None
+    harvest: NDArray[np.bool_] | None = None
+
+    @property
+    def energy(self) -> Array:
+        """Tokens (l, N) that pay for the packets of each sensor."""
+        energy: Array = namespace(self.tokens).broadcast_to(self.tokens, self.queue.shape)
+        return energy
+
+    @property
+    def total(self) -> Array:
+        """Tokens (N,) of all buckets."""
+        return self.tokens if self.tokens.ndim == 1 else linalg.total(self.tokens)
 
 
 class Delivery(NamedTuple):
@@ -74,7 +95,7 @@ class Network:
         delay: Probabilities of a delay of 0, 1, … steps, drawn for each packet.
         acknowledgement: Probability that the sender of a packet learns whether it arrives;
             otherwise it supposes that it does.
-        slots: Most grants in a step of an access rule with slots.
+        slots: Most grants in a step of an access rule with slots; channels of an assignment.
         channels: Number of channels of an access rule with collisions.
         discrepancy: ``"innovation"`` or ``"held"`` (:func:`~fusion_gym.core.access.discrepancy`).
         weights: Weights of the discrepancies, one number or (l, 1).
@@ -110,8 +131,9 @@ class Network:
         law = validation.not_negative("delay", self.delay, (len(self.delay),))
         if abs(law.sum() - 1.0) > 1e-9:
             raise forbidden("delay", self.delay, "it must have probabilities that sum to 1")
-        if self.channel is not None and self.channel.drop.shape[1] != self.sensors:
-            reason = f"it must have a loss for each of the {self.sensors} sensors"
+        sensors, channels = self.sensors, self._channels
+        if self.channel is not None and self.channel.drop.shape[1] != sensors * channels:
+            reason = f"it must have {channels} loss(es) for each of the {sensors} sensors"
             raise forbidden("channel", self.channel.drop, reason)
 
     @property
@@ -132,13 +154,25 @@ class Network:
     @property
     def draw_channels(self) -> int:
         """Number of standard normals that :meth:`draw` takes per run."""
-        parts = (self._moves, self._drops, self._longest > 0, self._reports_some, self._hops)
-        return self.sensors * sum(parts)
+        return sum(self._normals)
 
     @property
     def noise_channels(self) -> int:
         """Number of standard normals that :meth:`advance` takes per run."""
         return self.rule.random + self.draw_channels
+
+    @property
+    def _normals(self) -> tuple[int, ...]:
+        """Numbers of normals of moves, losses, delays, acknowledgements, hops and harvests."""
+        links, sensors = self.sensors * self._channels, self.sensors
+        pairs = (self._moves * links, self._drops * links)
+        parts = (self._longest > 0, self._reports_some, self._hops, self._harvests)
+        return *pairs, *(part * sensors for part in parts)
+
+    @property
+    def _channels(self) -> int:
+        """Number of links of each sensor."""
+        return self.slots if self.rule.by_channel else 1
 
     @property
     def _longest(self) -> int:
@@ -156,6 +190,10 @@ class Network:
     @property
     def _hops(self) -> bool:
         return self.rule.contended and self.channels > 1
+
+    @property
+    def _harvests(self) -> bool:
+        return self.bucket.harvest == "bernoulli" and not self.bucket.unlimited
 
     @property
     def _drops(self) -> bool:
@@ -216,8 +254,11 @@ class Network:
             state: Any state.
             noise: Standard normals (draw_channels, N).
         """
-        parts = iter(noise.reshape(-1, self.sensors, noise.shape[-1]))
+        ends = np.cumsum(self._normals)
+        cuts = zip(ends, self._normals, strict=True)
+        parts = (noise[end - size : end] for end, size in cuts if size)
         following, lost, delay, unreported, frequency = state.channel, None, None, None, None
+        harvest = None
         if self.channel is not None and following is not None:
             following = self.channel.advance(following, next(parts))
         if self.channel is not None and self._drops:
@@ -232,6 +273,8 @@ class Network:
         if self._hops:
             drawn = (ndtr(next(parts)) * self.channels).astype(np.int64)
             frequency = namespace(drawn).minimum(drawn, self.channels - 1)
+        if self._harvests:
+            harvest = ndtr(next(parts)) < self.bucket.rate
         return replace(
             state,
             following=following,
@@ -239,32 +282,34 @@ class Network:
             delay=delay,
             unreported=unreported,
             frequency=frequency,
+            harvest=harvest,
         )
 
-    def grant(
-        self, state: NetworkState, requests: NDArray[np.bool_], runs: Any = slice(None)
-    ) -> Grants:
+    def grant(self, state: NetworkState, requests: NDArray[Any], runs: Any = slice(None)) -> Grants:
         """Return the grants for requests (l, R) of the R ``runs``."""
+        check_requests(requests, self._channels * self.rule.by_channel)
         queue = state.queue[:, runs]
         if self.rule.turn is not None:
             requests = requests & state.admitted[:, runs]
         if self.rule.limited:
             place = queue if state.place is None else state.place[:, runs]
             requests = first_requests(requests, place, self.slots)
-        return self.bucket.grant(state.tokens[runs], requests, queue)
+        harvest = None if state.harvest is None else state.harvest[:, runs]
+        return self.bucket.grant(state.tokens[..., runs], requests, queue, harvest)
 
     def deliver(
-        self, state: NetworkState, requests: NDArray[np.bool_], reads_silence: bool = False
+        self, state: NetworkState, requests: NDArray[Any], reads_silence: bool = False
     ) -> tuple[NetworkState, Delivery]:
         """Return the state after the requests of a step, and what is delivered.
 
         Args:
             state: State before the requests.
-            requests: Sensors (l, N) bool.
+            requests: Sensors (l, N) bool, or with an assignment their channels from 1, 0 for none.
             reads_silence: Whether the reception has what silence may mean.
         """
         granted, spent, tokens, queue = self.grant(state, requests)
-        left = granted if state.lost is None else granted & ~state.lost
+        lost = self._lost(state, requests, granted)
+        left = granted if lost is None else granted & ~lost
         if self.rule.contended:
             frequency = 0 if state.frequency is None else state.frequency
             left = left & ~collisions(granted, frequency, self.channels)
@@ -280,8 +325,8 @@ class Network:
             possible = state.admitted & self.bucket.affordable(before)
             if self.rule.limited:
                 possible = possible & (granted.sum(0) < self.slots)
-            arrival = self.arrival_probability(state)
-            failure = None if arrival is None else 1.0 - arrival
+            arrival = self.link_probability(state)
+            failure = None if arrival is None else 1.0 - arrival[:, 0]
             reception = reception._replace(possible=possible, failure=failure)
         moved = NetworkState(
             tokens,
@@ -294,6 +339,19 @@ class Network:
         )
         return moved, Delivery(granted, spent, reception, supposed)
 
+    def _lost(
+        self, state: NetworkState, requests: NDArray[Any], granted: NDArray[np.bool_]
+    ) -> NDArray[np.bool_] | None:
+        """Return whether a packet (l, N) on its channel is lost; ``None`` if none is."""
+        probability = self.link_probability(state) if self.rule.by_channel else None
+        if state.lost is None or probability is None:
+            return state.lost
+        if requests.dtype == np.bool_:
+            requests = assign(granted, state.queue, probability)
+        sensor, run = np.ogrid[: self.sensors, : requests.shape[1]]
+        lost: NDArray[np.bool_] = state.lost.reshape(probability.shape)
+        return lost[sensor, requests - 1, run]
+
     def late(self, state: NetworkState) -> NDArray[np.bool_] | None:
         """Return the packets (D, l, N) of 1, …, D steps ago that arrive now; ``None`` if never.
 
@@ -303,21 +361,24 @@ class Network:
         steps = np.arange(1, self._longest + 1)
         return None if state.due is None else state.due == steps[:, None, None]
 
-    def arrival_probability(self, state: NetworkState) -> Array | None:
-        """Return the probability (l, N) that a packet sent now, alone, arrives now; ``None`` is 1.
+    def link_probability(self, state: NetworkState) -> Array | None:
+        """Return the probability (l, k, N) that a packet sent now, alone, arrives now.
 
-        It follows from the channels' state that was fed back.
+        It follows from the channels' state that was fed back; ``None`` is 1. k is the number of
+        channels of an assignment, and otherwise 1.
 
         Args:
             state: State before the requests.
         """
         if not self._drops and not self._longest:
             return None
-        arrival: Any = np.ones(state.queue.shape)
+        runs = state.queue.shape[-1]
+        arrival: Any = np.ones((self.sensors * self._channels, runs))
         if self.channel is not None and state.channel is not None:
-            sensor = np.arange(self.sensors)[:, None]
+            link = np.arange(len(arrival))[:, None]
             loss = namespace(state.channel).asarray(self.channel.transition @ self.channel.drop)
-            arrival = 1.0 - loss[state.channel, sensor]
+            arrival = 1.0 - loss[state.channel, link]
         elif self.channel is not None:
             arrival = arrival - self.channel.drop[0][:, None]
-        return self.delay[0] * arrival if self._longest else arrival
+        arrival = self.delay[0] * arrival if self._longest else arrival
+        return arrival.reshape(self.sensors, -1, runs)

@@ -45,17 +45,25 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     bucket, channel, price = task.network.bucket, task.network.channel, task.reward.price
     capacity, nodes = bucket.capacity, numbered(task.sensors)
     own, shared = partial(Block, node="own"), partial(Block, node="broadcast")
+    links = (numbered(task.network.slots),) if task.network.rule.by_channel else ()
     channels = own(
         "channel",
         "state of the channel at the step before, one-hot",
-        lambda runs: runs.channel_state()[:, None] == np.arange(len(STATES))[:, None],
-        (nodes, STATES),
+        lambda runs: runs.channel_state()[..., None, :] == np.arange(len(STATES))[:, None],
+        (nodes, *links, STATES),
     )
     tokens = shared(
         "tokens",
         "tokens over the capacity",
         lambda runs: runs.tokens / capacity,
         constants={"capacity": capacity},
+    )
+    energy = own(
+        "energy",
+        "tokens of the sensor's own bucket over its capacity",
+        lambda runs: runs.state.network.energy / capacity,
+        (nodes,),
+        constants={"capacity": np.ravel(capacity)},
     )
     admitted = own(
         "admitted",
@@ -85,7 +93,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     queues = bucket.sharing == "turns" and not bucket.unlimited
     return (
         *((channels,) if channel is not None and channel.states > 1 else ()),
-        tokens,
+        energy if bucket.per_sensor else tokens,
         *((admitted,) if task.network.rule.turn is not None else ()),
         *((queue,) if queues else ()),
         *((left,) if task.clock else ()),

@@ -24,16 +24,18 @@ from fusion_gym.importing import name_of
 AccessRule = Annotated[str, ACCESS]
 Tokens = Literal["limited", "unlimited"]
 SharingRule = Literal["equal", "fixed", "turns"]
+Budget = Literal["shared", "sensor"]
+Harvest = Literal["constant", "bernoulli"]
 ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
-Action = Literal["binary", "multidiscrete", "discrete"]
+Action = Literal["binary", "multidiscrete", "discrete", "assignment"]
 Backend = Literal["numpy", "jax"]
 # Options that affect the scale of the reward, besides plant and sensors.
 _SCALING = (
     "access", "slots", "discrepancy", "discrepancy_weights", "channels", "tokens", "token_rate",
-    "token_capacity", "initial_tokens", "token_cost", "sharing", "horizon", "channel",
-    "drop_probability", "channel_transition", "initial_channel", "delay",
+    "token_capacity", "initial_tokens", "token_cost", "sharing", "budget", "harvest", "horizon",
+    "channel", "drop_probability", "channel_transition", "initial_channel", "delay",
 )  # fmt: skip
 
 
@@ -67,7 +69,9 @@ class CommonOptions:
     ``"round_robin"`` admits one sensor per step in turn, ``"random"`` one at random. ``"slots"``
     grants the first ``slots`` requests in the queue, ``"try_once_discard"`` those with the largest
     discrepancies. With ``"collision"`` every request goes to one of ``channels`` at random, and two
-    on one are lost and paid for. With ``"single"`` the action space is ``Discrete(sensors + 1)``: 0
+    on one are lost and paid for. ``"assignment"`` grants at most ``channels`` requests, each on a
+    channel of its own, by default the free one of the highest probability of arrival in the order
+    of the queue. With ``"single"`` the action space is ``Discrete(sensors + 1)``: 0
     is no request, m + 1 is sensor m."""
     slots: int = 1
     """Most grants in a step with ``access="slots"`` or ``"try_once_discard"``."""
@@ -77,15 +81,22 @@ class CommonOptions:
     discrepancy_weights: ArrayLike = 1.0
     """Weights of the squared discrepancies: one number, or one per sensor."""
     channels: int = 1
-    """Channels of ``access="collision"``."""
+    """Channels of ``access="collision"`` or ``"assignment"``."""
     tokens: Tokens = "limited"
     """``"limited"`` applies the token bucket. ``"unlimited"`` grants every request and counts the
     tokens spent."""
-    token_rate: float = 5.0
+    budget: Budget = "shared"
+    """``"shared"`` is one bucket for all sensors. With ``"sensor"`` each sensor has a bucket of its
+    own, such as a battery; ``token_rate``, ``token_capacity`` and ``initial_tokens`` are then one
+    number, or one per sensor."""
+    harvest: Harvest = "constant"
+    """Tokens that a bucket gains per step: ``token_rate`` (``"constant"``), or with
+    ``budget="sensor"`` one token with the probability ``token_rate`` (``"bernoulli"``)."""
+    token_rate: ArrayLike = 5.0
     """Tokens g that the bucket gains per step (tobit_token_bucket, equation (17))."""
-    token_capacity: float = 30.0
+    token_capacity: ArrayLike = 30.0
     """Largest number b of tokens in the bucket (tobit_token_bucket, equation (17))."""
-    initial_tokens: float = 10.0
+    initial_tokens: ArrayLike = 10.0
     """Tokens ξ₀ at the start of an episode."""
     token_cost: ArrayLike = 3.0
     """Tokens c that a transmission costs: one number, or one per sensor."""
@@ -99,8 +110,9 @@ class CommonOptions:
     ``"gilbert_elliott"`` with a probability for each channel state. The network feeds the last
     channel states back."""
     drop_probability: ArrayLike | None = None
-    """Probability of a loss. Independent: one number, or one per sensor, by default 0.2.
-    Gilbert-Elliott: the pair (bad, good), by default (0.7, 0.2)."""
+    """Probability of a loss. Independent: one number, or one per sensor, by default 0.2; with
+    ``access="assignment"`` also a matrix (sensors, channels). Gilbert-Elliott: the pair (bad,
+    good), by default (0.7, 0.2)."""
     channel_transition: ArrayLike | None = None
     """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel.
     By default ((0.7, 0.3), (0.1, 0.9))."""
@@ -145,7 +157,9 @@ class CommonOptions:
     indistinguishable to a shared policy."""
     action: Action = "binary"
     """Action space: one bit u_m per sensor, as ``MultiBinary`` (``"binary"``) or as
-    ``MultiDiscrete`` (``"multidiscrete"``), or the number Σ u_m 2^m (``"discrete"``)."""
+    ``MultiDiscrete`` (``"multidiscrete"``), or the number Σ u_m 2^m (``"discrete"``).
+    ``"assignment"``, with that access, is ``MultiDiscrete([sensors + 1] * channels)``: each channel
+    has 0 for nobody or m + 1 for sensor m, and a sensor on several uses the first."""
     backend: Backend = "numpy"
     """Library that computes the steps. ``"jax"`` compiles the first step, in 1 to 20 seconds, and
     is then faster than ``"numpy"`` for few runs. It needs the extra ``jax``."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,7 +100,7 @@ class Lazy:
     def __init__(self, compute: Callable[[], Any]) -> None:
         self._compute = compute
 
-    @cached_property
+    @functools.cached_property
     def value(self) -> Any:
         """The value."""
         return self._compute()
@@ -155,20 +154,20 @@ class Runs:
 
     @property
     def tokens(self) -> Array:
-        """Tokens (N,)."""
-        return self.state.network.tokens
+        """Tokens (N,) of all buckets."""
+        return self.state.network.total
 
     @property
     def channels(self) -> int:
         """Number of standard normals of a step: the plant's, then the network's."""
         return self.task.plant.noise_channels + self.task.network.noise_channels
 
-    def deliver(self, requests: NDArray[np.bool_]) -> Outcome:
+    def deliver(self, requests: NDArray[Any]) -> Outcome:
         """Make the first half of a step with requests (sensors, N): grant, update, fuse, reward."""
         task, state, estimator = self.task, self.state, self.task.estimator
-        available, requested = task.plant.available(state.plant), requests
+        available, requested = task.plant.available(state.plant), requests > 0
         if available is not None:
-            requests = requests & available[0]
+            requests = requests * available[0]
         network, delivery = task.network.deliver(state.network, requests, estimator.reads_silence)
         (arrived, possible, failure), spent = delivery.reception, delivery.spent
         if available is not None and possible is not None:
@@ -211,12 +210,12 @@ class Runs:
         )
 
     def answer(
-        self, requests: NDArray[np.bool_], runs: NDArray[np.int64] | slice = slice(None)
+        self, requests: NDArray[Any], runs: NDArray[np.int64] | slice = slice(None)
     ) -> Grants:
         """Return the grants for requests (sensors, R) of the R ``runs``."""
         state, available = self.state, self.task.plant.available(self.state.plant)
         if available is not None:
-            requests = requests & available[0][:, runs]
+            requests = requests * available[0][:, runs]
         return self.task.network.grant(state.network, requests, runs)
 
     def sense(self, noise: Array) -> None:
@@ -270,7 +269,8 @@ class Runs:
 
     def arrival_probability(self) -> Array | None:
         """Return the probability (sensors, N) that a packet sent now arrives; ``None`` is 1."""
-        return self.task.network.arrival_probability(self.state.network)
+        links = self.task.network.link_probability(self.state.network)
+        return None if links is None else links.max(1)
 
     def admitted(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) with a reading that the access rule now admits."""
@@ -279,18 +279,21 @@ class Runs:
         return admitted if available is None else admitted & available[0]
 
     def channel_state(self) -> NDArray[np.int64]:
-        """Return the state (sensors, N) of each channel at the step before, 0 without states."""
-        known, queue = self.state.network.channel, self.state.network.queue
-        return np.zeros(queue.shape, dtype=np.int64) if known is None else known
+        """Return the signal ``channel_state``, 0 without states."""
+        known, network = self.state.network.channel, self.task.network
+        channels = (network.slots,) if network.rule.by_channel else ()
+        shape = (network.sensors, *channels, len(self.steps))
+        return np.zeros(shape, dtype=np.int64) if known is None else known.reshape(shape)
 
-    def _known_arrival(self) -> Array:
-        """Return the probability (sensors, N) that a packet sent now arrives."""
-        arrival = self.arrival_probability()
-        return np.ones(self.state.network.queue.shape) if arrival is None else arrival
+    def _known_links(self) -> Array:
+        """Return the probability (sensors, channels, N) that a packet sent now arrives."""
+        links, state = self.task.network.link_probability(self.state.network), self.channel_state()
+        known = np.ones(state.shape) if links is None else links
+        return known.reshape(len(state), -1, state.shape[-1])
 
     def grantable(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) whose single request the network would grant now."""
-        return self.admitted() & self.task.network.bucket.affordable(self.tokens)
+        return self.admitted() & self.task.network.bucket.affordable(self.state.network.tokens)
 
     def read(self, local: bool = False) -> dict[str, Any]:
         """Return the estimator's signals, with the network's probability of an arrival."""
@@ -309,12 +312,13 @@ class Runs:
     def signals(self) -> Signals:
         """Return the signals of all runs, except those that the information mode withholds.
 
-        The estimator's signals are extended by ``tokens`` (N,), ``token_cost`` (sensors, 1),
+        The estimator's signals are extended by ``tokens`` (N,) of all buckets, ``energy``
+        (sensors, N), which pays for each sensor's packets, ``token_cost`` (sensors, 1),
         ``price`` (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor
         granted least recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N)
-        bool, ``channel_state`` and ``arrival_probability`` (sensors, N), ``observation`` (N,
-        entries), ``estimate`` (the estimator's state) and the beliefs
-        (:mod:`fusion_gym.core.signals`). Policies of single sensors read what these suppose.
+        bool, ``observation`` (N, entries), ``estimate`` (the estimator's state), and the channels
+        and beliefs of :mod:`fusion_gym.core.signals`. Policies of single sensors read what these
+        suppose.
         """
         nodes = None if self.state.supposed is None else self._signals(local=True)
         return self._signals(nodes=nodes)
@@ -322,7 +326,8 @@ class Runs:
     def _signals(self, local: bool = False, nodes: Signals | None = None) -> Signals:
         network, values = self.state.network, self.read(local)
         values |= {
-            "tokens": network.tokens,
+            "tokens": network.total,
+            "energy": lambda: network.energy,
             "token_cost": self.task.network.bucket.cost,
             "price": self.price,
             "step": self.steps,
@@ -331,7 +336,8 @@ class Runs:
             "admitted": self.admitted,
             "grantable": self.grantable,
             "channel_state": self.channel_state,
-            "arrival_probability": self._known_arrival,
+            "arrival_probability": lambda: self._known_links().max(1),
+            "link_probability": self._known_links,
             "observation": functools.partial(self.observe, local),
             "estimate": self.state.estimate,
         }
@@ -348,13 +354,11 @@ class Branch(Runs):
         super().__init__(task, memory, layout)
         self.state, self.price, self.steps, self.limit = position
 
-    def step(
-        self, requests: NDArray[np.bool_], noise: Array, best: Estimate | None = None
-    ) -> Outcome:
+    def step(self, requests: NDArray[Any], noise: Array, best: Estimate | None = None) -> Outcome:
         """Make both halves of a step.
 
         Args:
-            requests: (sensors, N) bool.
+            requests: (sensors, N) bool, or with an assignment channels from 1, 0 for none.
             noise: Standard normals (channels, N).
             best: x* after the step, for runs of :meth:`Runs.branch_memory`.
         """

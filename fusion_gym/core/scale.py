@@ -85,18 +85,25 @@ def nominal_rate(network: Network) -> float:
 
 def sustained_rate(network: Network) -> float:
     """Return the packets per sensor and step that the network sustains."""
+    return float(_packets(network).mean())
+
+
+def _packets(network: Network) -> Array:
+    """Return the packets per step of each sensor, (buckets, 1) or one number."""
     bucket, rule, packets = network.bucket, network.rule, network.sensors
     if rule.turn is not None or rule.limited:
         packets = network.slots
     elif rule.contended:
         packets = min(network.channels, packets)
     most = packets / network.sensors
-    return most if bucket.unlimited else min(most, bucket.rate / float(bucket.cost.sum()))
+    paid = np.inf if bucket.unlimited else bucket.rate / bucket.round_cost
+    result: Array = np.minimum(most, paid)
+    return result
 
 
 def sustained_tokens(task: Task) -> float:
     """Return the tokens per step that the network lets all sensors spend in the long run."""
-    return sustained_rate(task.network) * float(task.network.bucket.cost.sum())
+    return float((_packets(task.network) * task.network.bucket.round_cost).sum())
 
 
 def nominal_error(task: Task) -> Array:

@@ -26,17 +26,32 @@ MEMORY_SIGNALS = (
 )
 NETWORK_SIGNALS = (
     Signal(
+        "energy",
+        "centre",
+        "(sensors, N)",
+        "tokens that pay for a sensor's packets: its own with budget='sensor', or the shared ones",
+        "own",
+    ),
+    Signal(
         "channel_state",
         "centre",
         "(sensors, N)",
-        "state of the channel at the step before: 0 bad, 1 good",
+        "state of the channel at the step before: 0 bad, 1 good; (sensors, channels, N) with "
+        '`access="assignment"`',
         "own",
     ),
     Signal(
         "arrival_probability",
         "centre",
         "(sensors, N)",
-        "probability that a packet sent now arrives now, by the model",
+        "probability that a packet sent now arrives now, by the model, on the best channel",
+        "own",
+    ),
+    Signal(
+        "link_probability",
+        "centre",
+        "(sensors, channels, N)",
+        "probability that a packet sent now on this channel of an assignment arrives now",
         "own",
     ),
 )

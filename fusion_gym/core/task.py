@@ -49,6 +49,7 @@ _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 _LONGEST = 100  # steps of a delay
 ONE_STEP = "the value of a packet counts only an arrival in this step"  # excludes a delay
 _MOST_DISCRETE = 16  # sensors with a discrete action of 2^sensors values
+_MOST_CHANNELS = 64  # of an assignment to fewer sensors
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Task:
             ``"centre"`` (the fusion centre's knowledge before any transmission).
         action: ``"binary"`` or ``"multidiscrete"`` (one bit u_m per sensor), or ``"discrete"`` (the
             number Σ u_m 2^m). With access ``"single"`` it is 0 for no request, m + 1 for sensor m.
+            ``"assignment"`` is that number for each channel of the access ``"assignment"``.
         packet: Content of a packet: ``"measurement"`` or ``"estimate"``.
         broadcast: ``"none"``, ``"estimate"`` or ``"packets"`` (:mod:`fusion_gym.core.memory`).
         memory: Whether the scheduler or each local sensor has memory.
@@ -135,6 +137,9 @@ class Task:
                 f"action = 'discrete' is not allowed with {self.sensors} sensors: it numbers all "
                 f"sets of requests, so it allows at most {_MOST_DISCRETE} sensors"
             )
+        if self.action == "assignment" and not self.network.rule.by_channel:
+            where = f"with access={self.network.access!r}"
+            raise forbidden("action", self.action, "it needs access='assignment'", where)
         if self.packet == "estimate":
             reason = "a late estimate cannot join what arrived before it"
             self.refuse_delay(reason, "with packet='estimate'")
@@ -148,9 +153,10 @@ class Task:
                 f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
                 f"plant has {states} states, so its shape must be ({states}, 1)"
             )
-        if self.network.rule.contended and self.estimator.reads_silence:
-            allowed = "without collisions, because a collision is no silence"
-            raise validation.refusal("access", "collision", allowed, "here")
+        shared = self.network.rule.contended or self.network.rule.by_channel
+        if shared and self.estimator.reads_silence:
+            allowed = "without shared channels, because a collision or a loss there is no silence"
+            raise validation.refusal("access", self.network.access, allowed, "here")
         if self.network.acknowledgement < 1.0:
             self._check_acknowledgements()
         if self.backend == "jax":
@@ -310,11 +316,13 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
         initial=options.initial_tokens,
         cost=options.token_cost,
         sensors=sensors,
-        sharing=options.sharing,
+        sharing=options.sharing if options.budget == "shared" else "equal",
         unlimited=options.tokens == "unlimited",
+        budget=options.budget,
+        harvest=options.harvest,
     )
     whole = float(bucket.cost.sum())
-    if not bucket.unlimited and bucket.capacity < whole:
+    if not bucket.unlimited and not bucket.per_sensor and bucket.capacity < whole:
         warnings.warn(
             f"token_capacity = {bucket.capacity:g} is below {whole:g}, the cost of one packet of "
             f"each of the {sensors} sensors: they cannot all transmit in one step",
@@ -340,17 +348,19 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
 def make_network(options: CommonOptions, sensors: int) -> Network:
     """Return the network of the options."""
     rule = ACCESS[options.access]
-    for name, used in (
-        ("slots", rule.limited and options.access != "single"),
-        ("channels", rule.contended),
-        ("discrepancy", rule.by_discrepancy),
-        ("discrepancy_weights", rule.by_discrepancy),
+    for name, used, by in (
+        ("slots", rule.limited and not rule.by_channel and options.access != "single", "access"),
+        ("channels", rule.contended or rule.by_channel, "access"),
+        ("discrepancy", rule.by_discrepancy, "access"),
+        ("discrepancy_weights", rule.by_discrepancy, "access"),
+        ("sharing", options.budget == "shared", "budget"),
     ):
-        value, default = getattr(options, name), getattr(CommonOptions, name)
+        value, default = getattr(options, name), getattr(type(options), name)
         if not used and plain_options(value) != default:
-            raise forbidden(name, value, "it has no use", f"with access={options.access!r}")
+            raise forbidden(name, value, "it has no use", f"with {by}={getattr(options, by)!r}")
     for name in ("slots", "channels"):
-        validation.integer(name, getattr(options, name), at_least=1, at_most=sensors)
+        most = max(sensors, _MOST_CHANNELS) if rule.by_channel else sensors
+        validation.integer(name, getattr(options, name), at_least=1, at_most=most)
     weights = validation.positive("discrepancy_weights", options.discrepancy_weights, (sensors,))
     return Network(
         make_bucket(options, sensors),
@@ -358,7 +368,7 @@ def make_network(options: CommonOptions, sensors: int) -> Network:
         make_channel(options, sensors),
         make_delay(options),
         acknowledgement=acknowledgement(options.acknowledgements),
-        slots=options.slots,
+        slots=options.channels if rule.by_channel else options.slots,
         channels=options.channels,
         discrepancy=options.discrepancy,
         weights=weights[:, None],
@@ -387,6 +397,11 @@ def make_channel(options: CommonOptions, sensors: int) -> Channel | None:
     if kind == "perfect":
         return None
     drop = _DROP[kind] if options.drop_probability is None else options.drop_probability
+    if ACCESS[options.access].by_channel:
+        shape, sensors = (sensors, options.channels), sensors * options.channels
+        if kind == "independent":  # of one link for each pair
+            drop = validation.spread("drop_probability", validation.by_row(drop, shape), shape)
+            drop = drop.ravel()
     if kind == "independent":
         return Channel.independent(drop, sensors, options.true_drop_probability)
     matrix = _TRANSITION if options.channel_transition is None else options.channel_transition

@@ -179,7 +179,7 @@ class Film:
         self._level: Any = None
         if not bucket.unlimited:
             (self._level,) = self._axes[-1].plot([], [], color=_TOKENS, lw=1.6)
-            self._axes[-1].set(ylim=(0.0, 1.08 * bucket.capacity), ylabel="tokens")
+            self._axes[-1].set(ylim=(0.0, 1.08 * float(np.sum(bucket.capacity))), ylabel="tokens")
         self._axes[-1].set_xlabel("step")
         self._axes[-1].xaxis.get_major_locator().set_params(integer=True)
         for axis in self._axes:

@@ -24,6 +24,7 @@ without a star that belong to no sensor, with `broadcast="packets"` all entries 
 _PAGE = Path(__file__).with_name("page.md")  # a template for page()
 # Network blocks of some tasks, and their conditions.
 _NETWORK = {
+    "energy": 'in place of `tokens` with `budget="sensor"`',
     "admitted": 'only with `access="round_robin"` or `"random"`',
     "queue": 'only with `sharing="turns"` and limited tokens',
     "time_left": "only with `clock=True`",
@@ -40,6 +41,7 @@ _ACTIONS = {
     "binary": "A 1 requests the sensor",
     "multidiscrete": "A 1 requests the sensor",
     "discrete": "The number has a bit for each sensor, the lowest bit for sensor 0",
+    "assignment": "The number of each channel is 0 for nobody, m for sensor m - 1",
 }
 
 _QUEUE = ", sensors share limited tokens in turns"
@@ -100,15 +102,14 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
             rows[block.name] = _row(task, block, "" if visible else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
+    access = task.network.access if task.network.rule.by_channel else "round_robin"
     turns = replace(task.network.bucket, sharing="turns", unlimited=False)
-    network = replace(
-        task,
-        network=replace(task.network, access="round_robin", bucket=turns),
-        clock=True,
-        reward=price,
-    )
-    for block in network_blocks(network):
-        rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])
+    for bucket in (turns, replace(turns, budget="sensor")):
+        network = replace(task.network, access=access, bucket=bucket)
+        every = replace(task, network=network, clock=True, reward=price)
+        for block in network_blocks(every):
+            condition = "" if block.name in always else _NETWORK[block.name]
+            rows[block.name] = _row(task, block, condition)
     return table(("entries", "range", "a sensor observes", "meaning"), rows.values())
 
 

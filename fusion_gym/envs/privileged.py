@@ -75,12 +75,12 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         super().__init__(task, num_envs, **options)
         if error != "squared":
             self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)
-        self._requests: NDArray[np.bool_] | None = None
+        self._requests: NDArray[Any] | None = None
         self._observed: NDArray[np.float32] | None = None  # rows of the present step
         self._branched: Branched | None = None
 
     def step_alternatives(
-        self, actions: NDArray[Any], requests: NDArray[np.bool_]
+        self, actions: NDArray[Any], requests: NDArray[Any]
     ) -> tuple[VecEnvStepReturn, Branched]:
         """Make one step in every run, and evaluate other requests on the same noise.
 
@@ -110,7 +110,7 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
     def _observe(self) -> NDArray[np.float32]:
         return super()._observe() if self._observed is None else self._observed
 
-    def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
+    def _advance(self, requests: NDArray[Any]) -> Outcome:
         self._observed = None
         if self._requests is None:
             return super()._advance(requests)

@@ -180,7 +180,7 @@ class FusionSB3VecEnv(VecEnv):
         """Begin new episodes in all runs."""
         self.batch.reset(stagger=self.stagger)
 
-    def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
+    def _advance(self, requests: NDArray[Any]) -> Outcome:
         """Step the batch, before finished runs are reset."""
         return self.batch.step(requests)
 

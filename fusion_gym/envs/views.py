@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from fusion_gym.core.access import channel_requests
 from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import ObservationEntry, ObservationLayout
@@ -32,7 +33,8 @@ class SchedulerView:
     The action space is ``MultiBinary(sensors)``, with ``action="multidiscrete"``
     ``MultiDiscrete([2] * sensors)``. With ``action="discrete"`` it is ``Discrete(2**sensors)`` for
     the number Σ u_m 2^m, and with ``access="single"`` it is ``Discrete(sensors + 1)``: 0 is no
-    request, m is sensor m - 1.
+    request, m is sensor m - 1. With ``action="assignment"`` it is that number for each channel,
+    ``MultiDiscrete([sensors + 1] * channels)``.
     """
 
     rows_per_run, local = 1, False
@@ -44,6 +46,7 @@ class SchedulerView:
         self.names = layout.names
         self.space = spaces.Box(layout.low, layout.high, dtype=np.float32)
         self._sensors, self._single = task.sensors, task.network.access == "single"
+        self._channels = task.network.slots if task.action == "assignment" else 0
         self.actions: Actions = spaces.MultiBinary(task.sensors)
         if self._single:
             self.actions = spaces.Discrete(task.sensors + 1)
@@ -51,13 +54,15 @@ class SchedulerView:
             self.actions = spaces.Discrete(2**task.sensors)
         elif task.action == "multidiscrete":
             self.actions = spaces.MultiDiscrete([2] * task.sensors)
+        elif self._channels:
+            self.actions = spaces.MultiDiscrete([task.sensors + 1] * self._channels)
 
     def rows(self, observation: Rows) -> Rows:
         """Return the observations unchanged."""
         return observation
 
-    def requests(self, actions: Any, runs: int | None) -> Requests:
-        """Return the requests (sensors, N) of actions (N, sensors) or (N,).
+    def requests(self, actions: Any, runs: int | None) -> NDArray[Any]:
+        """Return the requests (sensors, N) of actions (N, sensors) or (N,), or assigned channels.
 
         Args:
             actions: Actions of N runs, or of one run without the axis N.
@@ -69,18 +74,21 @@ class SchedulerView:
         """
         shape = self.actions.shape or ()
         array = _numbers(actions, shape if runs is None else (runs, *shape))
+        if self._channels:
+            _whole(array, self._sensors)
+            return channel_requests(array.reshape(-1, *shape).T, self._sensors)
         if not isinstance(self.actions, spaces.Discrete):
             requests = _bits(array)
             return np.ascontiguousarray((requests[None] if runs is None else requests).T)
-        high = int(self.actions.n) - 1
-        _check(array, (array >= 0) & (array <= high) & (array == np.floor(array)), f"0..{high}")
+        _whole(array, int(self.actions.n) - 1)
         return self._decoded(array.astype(np.int64).reshape(-1))
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """Return the allowed choices (N, choices) in the layout of sb3-contrib's MaskablePPO.
 
         ``MultiBinary`` and ``MultiDiscrete`` have two choices per sensor, silence and a request.
-        ``Discrete`` has one choice per number, which is allowed if all its requests are.
+        ``Discrete`` has one choice per number, which is allowed if all its requests are. An
+        assignment has for each channel nobody and every sensor.
 
         Args:
             allowed: (sensors, N), whether the sensor may request.
@@ -88,6 +96,9 @@ class SchedulerView:
         if isinstance(self.actions, spaces.Discrete):
             requested = self._decoded(np.arange(self.actions.n))
             return np.asarray(~(requested[:, None] & ~allowed[:, :, None]).any(axis=0))
+        if self._channels:
+            open_ = np.insert(allowed, 0, values=True, axis=0).T
+            return np.tile(open_, self._channels)
         result = np.ones((allowed.shape[1], self._sensors, 2), dtype=np.bool_)
         result[..., 1] = allowed.T
         return result.reshape(len(result), -1)
@@ -128,6 +139,9 @@ class SensorView:
         if task.information != "sensors":
             allowed = "'sensors', because a sensor uses its own measurement"
             raise refusal("information", task.information, allowed, "with a local view")
+        if task.action == "assignment":
+            allowed = "'binary', because the scheduler assigns channels"
+            raise refusal("action", task.action, allowed, "with a local view")
         layout, count = ObservationLayout(task, "own"), task.sensors
         received = [
             p for p, entry in enumerate(layout.entries) if is_received(entry, task.broadcast)
@@ -213,6 +227,12 @@ def _bits(values: NDArray[Any]) -> Requests:
     requests: Requests = values == 1
     _check(values, requests | (values == 0), "0 or 1")
     return requests
+
+
+def _whole(values: NDArray[Any], high: int) -> None:
+    """Check that the actions are whole numbers from 0 to ``high``."""
+    valid = (values >= 0) & (values <= high) & (values == np.floor(values))
+    _check(values, valid, f"0..{high}")
 
 
 def _check(values: NDArray[Any], valid: NDArray[np.bool_], allowed: str) -> None:

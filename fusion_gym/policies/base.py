@@ -26,7 +26,8 @@ class Policy(Protocol):
     """A function from signals to requests, for N runs.
 
     ``reset(runs, seed)`` precedes the first call; a policy that draws uses ``seed``. A call takes
-    the signals of one step and returns requests (sensors, N) bool. A run begins a new episode where
+    the signals of one step and returns requests (sensors, N) bool; with ``access="assignment"``
+    they may be channels from 1, and 0 for silence. A run begins a new episode where
     ``signals["start"]`` is true.
 
     A policy that uses beliefs (:mod:`fusion_gym.core.signals`) has an attribute ``memory_owner``,
@@ -72,6 +73,9 @@ def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     every = (*task.estimator.signals, *MEMORY_SIGNALS, *NETWORK_SIGNALS, *PLANNING_SIGNALS)
     least = {signal.name: signal for signal in every}
     node: Knowledge = "own" if covers(task.knowledge, "own") else task.knowledge
+    bucket = task.network.bucket
+    if bucket.per_sensor and not bucket.unlimited:  # a sensor knows only its own energy
+        least["tokens"] = Signal("tokens", "centre", "(N,)", "tokens of all buckets")
     least["observation"] = Signal("observation", node, "(N, entries)", "rows of every class")
     return {
         name: f"signal {name!r} belongs to the class {signal.knowledge!r}, and the policy "
@@ -279,7 +283,7 @@ def check_price(name: str, value: float | None) -> None:
 
 def shape_of(signals: Signals) -> tuple[int, int]:
     """Return the number of sensors and of runs."""
-    return len(signals["token_cost"]), len(signals["tokens"])
+    return len(signals["token_cost"]), len(signals["step"])
 
 
 def surprise(signals: Signals, whitened: bool = False) -> Array:

@@ -131,10 +131,10 @@ class CalibratedPolicy(Stateless):
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
-        tokens = signals["tokens"]
-        price = signals["price"] if self.price is None else np.full(tokens.shape, self.price)
+        price = signals["price"]
+        price = price if self.price is None else np.full(price.shape, self.price)
         agent, mixture, threshold = self.at(np.asarray(price))
-        score = np.zeros((self.task.sensors, len(tokens)))
+        score = np.zeros((self.task.sensors, len(price)))
         if (mixture > 0.0).any():  # a share of 0 takes no part, where a score may be infinite
             score += mixture * np.where(mixture > 0.0, self.rule.log_ratio(signals), 0.0)
         if (mixture < 1.0).any():

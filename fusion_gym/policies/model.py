@@ -132,7 +132,8 @@ class ModelPolicy:
             allowed = "an agent with one logit for each sensor (ppo, a2c, trpo, maskable_ppo)"
             raise refusal("policy", type(model).__name__, allowed)
         together = isinstance(actions, spaces.Discrete) and self.view.rows_per_run == 1
-        if together and self.task.network.access != "single":
+        together = together and self.task.network.access != "single"
+        if together or self.task.action == "assignment":
             raise refusal("action", str(actions), "MultiBinary, MultiDiscrete, or access='single'")
 
     def logits(self, signals: Signals) -> Array:

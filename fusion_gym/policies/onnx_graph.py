@@ -50,6 +50,9 @@ class DecisionGraph(torch.nn.Module):
         if not agent.deterministic:
             allowed = "True; the graph also returns the probability of every request"
             raise refusal("deterministic", False, allowed, "here")
+        if agent.task.action == "assignment":
+            allowed = "another kind, because the graph requests without channels"
+            raise refusal("action", agent.task.action, allowed, "here")
         if not isinstance(policy, tuple(POLICIES.values())):
             raise ConfigurationError(
                 f"policy {type(policy).__name__} is not allowed here: it must be a policy of "

@@ -59,6 +59,7 @@ _SHIPPED: dict[Kind, dict[str, str]] = {
         "information_gain": "rules.schedules:InformationGain",
         "innovation_threshold": "rules.measurements:InnovationThreshold",
         "local_variance": "rules.schedules:LocalVariance",
+        "maximum_age": "rules.schedules:MaximumAge",
         "never": "rules.schedules:Never",
         "paced": "rules.schedules:Paced",
         "periodic": "rules.schedules:Periodic",
@@ -70,6 +71,8 @@ _SHIPPED: dict[Kind, dict[str, str]] = {
         "variance_threshold": "rules.schedules:VarianceThreshold",
     },
     "reference": {
+        "age_index": "ages:AgeIndex",
+        "age_optimum": "ages:AgeOptimum",
         "estimate_difference": "rules.beliefs:EstimateDifference",
         "kullback_leibler": "rules.beliefs:KullbackLeibler",
         "optimal": "optimal:OptimalPolicy",
@@ -294,7 +297,8 @@ def _try_out(spec: str, policy: Policy, task: Task) -> None:
         raise ConfigurationError(f"policy {spec!r}: {error.args[0]}") from None
     policy.reset(1)
     shape, kind = np.shape(requests), np.asarray(requests).dtype
-    if shape != (task.sensors, 1) or kind != np.bool_:
+    numbers = task.network.rule.by_channel and kind == np.int64
+    if shape != (task.sensors, 1) or not (kind == np.bool_ or numbers):
         raise ConfigurationError(
             f"policy {spec!r} returns an array of {kind} {shape}: it must be bool "
             f"({task.sensors}, 1), sensors and runs"

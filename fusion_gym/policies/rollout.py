@@ -68,11 +68,10 @@ class Imagination:
         steps, estimate = signals["step"][runs], take_runs(signals["estimate"], runs)
         own, rest_of_first = first[: self._of_plant], first[self._of_plant :]
         plant = task.plant.draw(estimate.measurement, mean, covariance, own, steps + 1.0)
-        known = NetworkState(
-            signals["tokens"][runs], signals["queue"][:, runs], signals["admitted"][:, runs]
-        )
+        tokens = signals["energy" if task.network.bucket.per_sensor else "tokens"][..., runs]
+        known = NetworkState(tokens, signals["queue"][:, runs], signals["admitted"][:, runs])
         if task.network.channel is not None and task.network.channel.states > 1:
-            known.channel = signals["channel_state"][:, runs]
+            known.channel = signals["channel_state"][..., runs].reshape(-1, len(runs))
         network = rank_requests(task, task.network.draw(known, rest_of_first), estimate)
         state = State(plant, estimate, network)
         limit = np.full_like(steps, task.horizon)
@@ -200,6 +199,9 @@ class Rollout:
 
     def _choices(self, own: Requests) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
         """Return first decisions (choices, sensors, N) and the number of the base's (N,)."""
+        if own.dtype != np.bool_:
+            allowed = "a policy that assigns no channels"
+            raise validation.refusal("base", type(self.base).__name__, allowed)
         sensors, runs = own.shape
         single = np.eye(sensors + 1, sensors, k=-1, dtype=np.bool_)  # silence first
         choices = np.repeat(single[..., None], runs, axis=-1)

@@ -1,6 +1,6 @@
 """The optimal cost of remote estimation by dynamic programming, and bounds on it."""
 
-from fusion_gym.solvers.ages import AgeSolution, solve_ages
+from fusion_gym.solvers.ages import AgeSolution, AgeSource, age_index, age_sources, solve_ages
 from fusion_gym.solvers.joint import (
     JointAverageSolution,
     JointFiniteSolution,
@@ -23,6 +23,7 @@ from fusion_gym.solvers.task import Optimum, solve_task, source_problems
 
 __all__ = [
     "AgeSolution",
+    "AgeSource",
     "AverageSolution",
     "DiscountedSolution",
     "DualBound",
@@ -34,6 +35,8 @@ __all__ = [
     "Optimum",
     "SourceProblem",
     "TokenLevels",
+    "age_index",
+    "age_sources",
     "lagrangian_bound",
     "solve_ages",
     "solve_average",

@@ -89,7 +89,9 @@ class TokenLevels:
         choices = np.arange(2**sensors)
         sets = (choices >> np.arange(sensors)[:, None] & 1).astype(np.bool_)
         spent = (sets * bucket.cost).sum(0)
-        start = float(bucket.start(1)[0])
+        if bucket.per_sensor and not bucket.unlimited:
+            raise validation.refusal("budget", "sensor", "'shared'", "for the exact optimum")
+        start = float(np.max(bucket.start(1)))
         if bucket.unlimited:
             everything = np.ones((1, len(choices)), dtype=np.bool_)
             return cls(np.array([start]), 0, everything, np.zeros((1, len(choices)), int), spent)

@@ -56,6 +56,9 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     """
     system, channel, reward = _sources(task), task.network.channel, task.reward
     task.refuse_delay("the optimum supposes arrivals in the step of a request")
+    if task.network.rule.by_channel:
+        where = "for the optimum"
+        raise validation.refusal("access", task.network.access, "without an assignment", where)
     if task.network.acknowledgement < 1.0:
         value, allowed = task.settings.get("acknowledgements"), "'perfect'"
         raise validation.refusal("acknowledgements", value, allowed, "for the optimum")

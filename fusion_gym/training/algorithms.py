@@ -181,7 +181,7 @@ TABLE = {
     "recurrent_ppo": Algorithm(
         f"{_MORE}RecurrentPPO", RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
         "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy",
-        actions=("multidiscrete", "discrete"),
+        actions=("multidiscrete", "discrete", "assignment"),
     ),
 }  # fmt: skip
 

@@ -22,6 +22,7 @@ from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.access import channel_requests
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError
@@ -353,35 +354,38 @@ class Decisions:
 
     - ``"all"``: one factor, whose choices are all actions of a scheduler.
     - ``"flips"``: one factor per sensor, silence or a request, with the other sensors unchanged;
-      also for local decisions.
+      also for local decisions. An assignment has one factor per channel, whose choices are nobody
+      and every sensor.
 
     Args:
         env: the environment.
         kind: kind of alternatives; None for the default.
 
     Raises:
-        ConfigurationError: flips of an action that is one number, or all sets of more than 10
-            sensors.
+        ConfigurationError: flips of an action that is one number, all assignments, or all sets of
+            more than 10 sensors.
     """
 
     def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
         self.view, self.local = env.view, isinstance(env.view, SensorView)
         self.sensors, self.runs = env.task.sensors, env.runs
         space = env.action_space
-        self.binary = not isinstance(space, Discrete)
-        if self.local:
+        self.assigns = env.task.action == "assignment"
+        self.binary = not isinstance(space, Discrete) and not self.assigns
+        if self.local or self.assigns:
             self.kind: Kind = "flips"
         elif not self.binary:
             self.kind = "all"
         else:
             few = self.sensors < 60 and 2**self.sensors <= MOST_ALTERNATIVES
             self.kind = kind or ("all" if few else "flips")
+        form = "assigns channels" if self.assigns else "is one number"
         if kind is not None and kind != self.kind:
             raise ConfigurationError(
                 f"alternatives = {kind!r} is not allowed here: it must be {self.kind!r}, because "
-                + ("sensors decide locally" if self.local else "an action is one number")
+                + ("sensors decide locally" if self.local else f"an action {form}")
             )
-        self.choices = 2
+        self.choices = self.sensors + 1 if self.assigns else 2
         if self.kind == "all":
             self.choices = 2**self.sensors if self.binary else int(space.n)  # type: ignore[attr-defined]
             if self.choices > 2**MOST_SENSORS:
@@ -404,8 +408,10 @@ class Decisions:
 
         Args:
             logits: for ``Discrete`` (runs, choices), for local decisions (runs, sensors, 2), for
-                bits (runs, sensors).
+                bits (runs, sensors), for an assignment (runs, channels · choices).
         """
+        if self.assigns:
+            return torch.log_softmax(logits.reshape(len(logits), -1, self.choices), -1)
         if not self.binary:
             values = torch.log_softmax(logits, -1)
             return values if self.local else values[:, None]
@@ -424,16 +430,20 @@ class Decisions:
 
     def actions(self, choice: Choices) -> NDArray[Any]:
         """Return the actions of the rows from the choices (runs, D)."""
+        if self.assigns or (self.binary and self.kind == "flips"):
+            return choice
         if not self.binary:
             return choice.reshape(-1)
-        if self.kind == "flips":
-            return choice
         return choice >> np.arange(self.sensors) & 1
 
     def alternatives(self, choice: Choices) -> NDArray[Any]:
         """Return the alternative requests (A, sensors, N) of the choices (runs, D)."""
         if self.kind == "all":
             return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
+        if self.assigns:
+            changed = np.eye(choice.shape[1], dtype=np.bool_)[:, None, :, None]
+            each = np.where(changed, np.arange(self.choices)[:, None, None], choice.T)
+            return channel_requests(each.reshape(-1, *choice.T.shape), self.sensors)
         taken = choice.T == 1
         return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
 
@@ -441,6 +451,8 @@ class Decisions:
         """Return the values (runs, D, C) of all choices, from taken and stepped (A, runs) ones."""
         if self.kind == "all":
             return stepped.T[:, None]
+        if self.assigns:
+            return stepped.T.reshape(len(choice), -1, self.choices)
         flipped = stepped.T
         rest = np.broadcast_to(taken[:, None], flipped.shape)
         request = choice == 1

@@ -111,18 +111,20 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
         rate: share of the steps with a request of a sensor.
 
     Returns:
-        Logits (sensors,) of the requests, or one per number of ``Discrete``.
+        Logits (sensors,) of the requests, or one per number of ``Discrete`` or of a channel.
     """
     odds, space, sensors = np.log(rate / (1.0 - rate)), env.action_space, env.task.sensors
-    if not isinstance(space, Discrete):
-        return np.full(sensors, odds)
     if isinstance(env.view, SensorView):
         return np.array([0.0, odds])
-    if env.task.network.access == "single":
-        if sensors * rate >= 1.0:
-            allowed = f"< 1/{sensors}, because one of {sensors} sensors transmits in a step"
+    if env.task.network.access == "single" or env.task.action == "assignment":
+        channels = env.task.network.slots
+        share = rate / channels  # of each channel
+        if sensors * share >= 1.0:
+            allowed = f"< {channels}/{sensors}, because one of {sensors} sensors uses a channel"
             raise refusal("initial_rate", rate, allowed)
-        return np.log([1.0 - sensors * rate, *[rate] * sensors])
+        return np.tile(np.log([1.0 - sensors * share, *[share] * sensors]), channels)
+    if not isinstance(space, Discrete):
+        return np.full(sensors, odds)
     bits = np.arange(2**sensors)[:, None] >> np.arange(sensors) & 1
     return np.asarray(bits.sum(1) * odds)
 

@@ -35,6 +35,8 @@ NOISY: Options = {
     "true_measurement_noise": 2.0,
     "memory": True,
 }
+PAIRS: Options = {"access": "assignment", "channels": 2}
+QUALITY = ((0.1, 0.8), (0.7, 0.2), (0.4, 0.5))
 # Options that every environment has.
 COMMON: list[Options] = [
     {},
@@ -126,10 +128,14 @@ NETWORKS: dict[str, list[Options]] = {
         {"channel": "gilbert_elliott", "acknowledgements": "none", "memory": True},
         {"access": "try_once_discard", "discrepancy": "held"} | SCARCE,
         {"delay": 2},
+        {"budget": "sensor", "harvest": "bernoulli", "memory": True} | SCARCE,
+        PAIRS | {"channel": "independent", "drop_probability": QUALITY, "memory": True},
     ],
     "LinearFusion": [
         {"access": "collision", "channel": "independent", "memory": True},
         {"delay": (0, 2), "memory": True, "channel": "independent"},
+        {"budget": "sensor", "access": "single"} | SCARCE | {"token_rate": (0.2, 0.9)},
+        PAIRS | {"channel": "gilbert_elliott", "delay": (0, 1)} | SCARCE,
     ],
     "TobitOscillator": [{"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE],
     "MarkovJumpTracking": [{"channel": "independent", "acknowledgements": 0.4}],
@@ -139,6 +145,12 @@ NETWORKS: dict[str, list[Options]] = {
         {"sensors": 3, "access": "collision", "channels": 2},
         {"sensors": 3, "access": "try_once_discard", "slots": 2},
         LOSSY | {"delay": (1, 3), "information": "centre"},
+        {"sources": (3, 1), "memory": True, "access": "any"} | SCARCE,
+        {"sources": (2, 4), "channel": "independent", "acknowledgements": "none"},
+        LOSSY
+        | {"filter": "truncated", "trigger": "send_on_delta", "trigger_threshold": 1.5}
+        | {"budget": "sensor"}
+        | SCARCE,
     ],
 }
 
@@ -153,11 +165,15 @@ class Case:
     @functools.cache  # noqa: B019  cases live as long as the tests
     def task(self, **more: Any) -> Task:
         """The task, with further options; those of the network are exchanged, which is quick."""
+        if self.options.get("budget") == "sensor":  # nothing to share
+            more.pop("sharing", None)
         if more and more.keys() <= SCARCE.keys() | FREE.keys():
             task = self.task()
             selection: Any = SimpleNamespace(**task.settings | more)
             bucket = make_bucket(selection, task.sensors)
-            network = replace(task.network, bucket=bucket, access=selection.access)
+            fixed = task.network.rule.by_channel  # its links are those of the access
+            access = task.network.access if fixed else selection.access
+            network = replace(task.network, bucket=bucket, access=access)
             return replace(task, network=network, settings=vars(selection))
         return fusion_gym.make_task(self.env_id, **self.options | more)
 

@@ -103,14 +103,19 @@ def test_only_grants_cost_tokens_and_the_balance_closes(case: Case) -> None:
         selection, cost = batch.task.settings, batch.signals()["token_cost"][:, 0]
         rate, capacity = selection["token_rate"], selection["token_capacity"]
         for request in requests(batch.task, 3, STEPS):
-            before = batch.signals()["tokens"].copy()
+            network, own = batch.state.network, selection["budget"] == "sensor"
+            before, gained = network.energy.copy(), network.harvest
             outcome = batch.step(request)
             assert not (outcome.granted & ~request).any()
             np.testing.assert_allclose(outcome.cost, cost @ outcome.granted)
             if selection["tokens"] == "limited":
-                assert (outcome.cost <= before + 1e-9).all()
-                before = np.minimum(capacity, before - outcome.cost + rate)
-            np.testing.assert_allclose(batch.signals()["tokens"], before, atol=1e-9)
+                spent = outcome.granted * cost[:, None] if own else outcome.cost
+                assert (before + 1e-9 >= spent).all()
+                gained = np.reshape(rate, (-1, 1)) if gained is None else gained
+                before = np.minimum(capacity, before - spent + gained)
+            total = before.sum(0) if own else before[0]
+            np.testing.assert_allclose(batch.signals()["energy"], before, atol=1e-9)
+            np.testing.assert_allclose(batch.signals()["tokens"], total, atol=1e-9)
 
 
 @each_case
@@ -195,17 +200,18 @@ UNCERTAIN: list[Options] = [
     {"channel": "gilbert_elliott"},
     {"access": "collision", "channels": 2},
     {"delay": (0, 3)},
+    {"budget": "sensor", "harvest": "bernoulli"} | SCARCE,
 ]
 
 
 @pytest.mark.parametrize("options", UNCERTAIN, ids=lambda options: next(iter(options)))
 @each_id
 def test_nothing_shown_knows_what_becomes_of_the_next_packet(env_id: str, options: Options) -> None:
-    """Neither its loss, its delay, its channel nor the true probability of a loss."""
+    """Neither its loss, its delay, its channel, the true probability of a loss nor the harvest."""
     more: Options = THREE.get(short(env_id), {}) if "channels" in options else {}
     if "channels" in options and "RandomWalk" in env_id:  # one sensor has one channel
         return
-    task = fusion_gym.make_task(env_id, tokens="unlimited", **options | more)
+    task = fusion_gym.make_task(env_id, **{"tokens": "unlimited"} | options | more)
     batch = EpisodeBatch.seeded(task, 60, 0)
     for request in requests(task, 60, 4):
         batch.step(request)
@@ -220,8 +226,9 @@ def test_nothing_shown_knows_what_becomes_of_the_next_packet(env_id: str, option
         np.testing.assert_array_equal(batch.signals()[name], branch.signals()[name], err_msg=name)
     np.testing.assert_array_equal(batch.observe(), branch.observe())
     np.testing.assert_array_equal(batch.grantable(), branch.grantable())
-    fates = [runs.deliver(everyone).arrived for runs in (batch, branch)]
-    assert (fates[0] != fates[1]).any()
+    fates = [(runs.deliver(everyone).arrived, runs.delivered.network.energy)
+             for runs in (batch, branch)]  # fmt: skip
+    assert any((one != two).any() for one, two in zip(*fates, strict=True))
 
 
 def test_every_environment_is_under_the_laws() -> None:

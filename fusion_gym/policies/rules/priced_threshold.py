@@ -129,7 +129,8 @@ class PricedThreshold(BeliefRule):
         numbers, bucket = self.numbers, self.task.network.bucket
         age = np.maximum(signals["age"], 0.0)
         price = signals["price"] if self.price is None else np.asarray(self.price)
-        tokens = (signals["tokens"] + 1.0) / (bucket.capacity + 1.0)
+        level = signals["energy" if bucket.per_sensor else "tokens"]
+        tokens = (level + 1.0) / (bucket.capacity + 1.0)
         price = price / self.reference_price
         least = numbers.threshold * price**numbers.price_exponent
         if not bucket.unlimited:

@@ -338,6 +338,41 @@ class VarianceThreshold(Rule):
 
 
 @dataclass
+class MaximumAge(Rule):
+    r"""Request the sensors whose last delivery is oldest.
+
+    Args:
+        at_most: most requests in a step; None for no limit.
+        least: least age of a request, in steps, >= 1.
+
+    Equation:
+        $$
+        a_i(t)\ge a_{\min}\ \text{and}\ i\ \text{among the largest}\ a_i\ \Rightarrow\ \delta_i(t)=1
+        $$
+
+        a are the steps since the last delivery of a sensor, a_min is ``least``; ``at_most`` sensors
+        are requested.
+
+    Assumes: sources that are alike.
+
+    Source: A. M. Bedewy, Y. Sun and N. B. Shroff, "Minimizing the age of information through
+    queues", IEEE Trans. Information Theory 65, 2019, for maximum age first.
+
+    Example: ``maximum_age:at_most=2`` in ``fusion_gym/RemoteEstimation-v1 sensors=6 access=slots
+    slots=2``.
+    """
+
+    at_most: int | None = parameter(1, check_at_most)
+    least: int = parameter(1, validation.integer, at_least=1)
+    knowledge: ClassVar[Knowledge] = "centre"
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Return the requests (sensors, N)."""
+        age = signals["age"]
+        return strongest(age, age >= self.least, self.at_most, age)
+
+
+@dataclass
 class InformationGain(Rule):
     r"""Request where the relative reduction of the fused trace per token is >= ``threshold``.
 

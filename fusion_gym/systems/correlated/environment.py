@@ -87,7 +87,7 @@ class CorrelatedTrackingOptions(PaperOptions):
     """Actual variances over their bounds, equation (4): a number in (0, 1]. ``"random"`` draws it
     for each episode, evenly in [0.4, 1]."""
     tokens: Tokens = "unlimited"
-    token_rate: float = 3.0
+    token_rate: ArrayLike = 3.0
     fusion: Annotated[str, _STRUCTURE.offered] = "sici"
     """Rule that joins the estimates. ``"sici"`` is sequential inverse covariance intersection
     (47)-(54), the most accurate. ``"sci"`` is sequential covariance intersection (37)-(42), whose

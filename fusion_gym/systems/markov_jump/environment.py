@@ -104,7 +104,7 @@ class MarkovJumpTrackingOptions(PaperOptions):
     measurement_variance: ArrayLike = (0.49, 0.36, 0.9)
     """Variance R_η of η, Section 6: one number, or one per sensor."""
     tokens: Tokens = "unlimited"
-    token_rate: float = 3.0
+    token_rate: ArrayLike = 3.0
     filter: Annotated[str, FILTERS] = "local"
     """``"local"`` is the paper's filter at each node, equations (12)-(22): packets carry estimates.
     ``"centralised"`` and ``"imm"`` are one filter at the centre: packets carry measurements."""

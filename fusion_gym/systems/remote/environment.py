@@ -7,9 +7,9 @@ Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +19,15 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
+from fusion_gym.errors import forbidden
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
+from fusion_gym.systems.remote.vector import (
+    VectorEstimator,
+    VectorSources,
+    make_sources,
+    vector_scale,
+)
 from fusion_gym.systems.silence import Silence, Trigger
 
 _FILTERS: dict[str, type] = {"symmetric": RemoteEstimator, "truncated": Silence}
@@ -52,8 +59,13 @@ class RemoteEstimationOptions(PaperOptions):
     """
 
     filters: ClassVar[Mapping[str, type]] = _FILTERS
+    sources: Sequence[Any] | None = None
+    """Vector sources, each with a sensor whose steady Kalman filter sends its estimate: a list of
+    mappings with ``transition`` A (n, n), ``process_covariance`` W, ``measurement_matrix`` C
+    (m, n) and ``measurement_covariance`` R. A pair (count, seed) draws sources of a growing and a
+    decaying state. ``None`` is ``sensors`` scalar sources."""
     sensors: int = 1
-    """Number of sources, each with one sensor."""
+    """Number of scalar sources, each with one sensor."""
     coefficient: ArrayLike = 1.0
     """Coefficient a of a source: one number, or one per source."""
     noise_deviation: ArrayLike = 1.0
@@ -71,9 +83,9 @@ class RemoteEstimationOptions(PaperOptions):
     trigger_threshold: ArrayLike | None = None
     """Threshold or reportable change of the policy ``trigger``: one number, or one per source."""
     tokens: Tokens = "unlimited"
-    token_rate: float = 0.25
-    token_capacity: float = 5.0
-    initial_tokens: float = 1.0
+    token_rate: ArrayLike = 0.25
+    token_capacity: ArrayLike = 5.0
+    initial_tokens: ArrayLike = 1.0
     token_cost: ArrayLike = 1.0
     horizon: int = 200
     cost_weight: float | Literal["random"] = 5.0
@@ -83,12 +95,19 @@ class RemoteEstimationOptions(PaperOptions):
         return replace(super().nominal(), filter="symmetric", trigger=None, trigger_threshold=None)
 
 
+_OF_SCALARS = (
+    "sensors", "coefficient", "noise_deviation", "initial_deviation", "error_scale", "filter",
+    "trigger", "trigger_threshold",
+)  # fmt: skip
+_SILENCE = 3  # steps of silence whose deviation scales observed differences, at least
 _WHERE = "with filter='symmetric'"
 _USUAL_PRICE = 5.0  # of a packet, in squared deviations of the noise
 
 
 def build_remote(options: RemoteEstimationOptions) -> Scenario:
     """Return the scenario of these options."""
+    if options.sources is not None:
+        return _build_vector(options)
     most = validation.MOST_SENSORS
     sensors = validation.integer("sensors", options.sensors, at_least=1, at_most=most)
     chosen = options.own_weights(sensors)
@@ -114,6 +133,29 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
         no_estimates="a packet carries the source's value",
         policy_defaults={} if silence is None else silence.policy_defaults,
         required_policy=options.trigger,
+    )
+
+
+def _build_vector(options: RemoteEstimationOptions) -> Scenario:
+    for name in _OF_SCALARS:
+        if getattr(options, name) != getattr(RemoteEstimationOptions, name):
+            reason = "it belongs to scalar sources"
+            raise forbidden(name, getattr(options, name), reason, "with sources")
+    model = VectorSources.create(
+        make_sources(options.sources), options, validation.horizon(options.horizon)
+    )
+    size, sensors = len(model.state_names), model.sensor_count
+    chosen = options.own_weights(size)
+    weights = np.ones(size) if chosen is None else chosen
+    steps = max(_SILENCE, round(float(_steps(options, sensors).max())))
+    estimator = VectorEstimator(model, vector_scale(model, steps), weights)
+    return Scenario(
+        options,
+        model,
+        estimator,
+        weights,
+        nodes_have_memory=True,  # a node's estimate has all its measurements
+        no_estimates="a packet carries the node's estimate",
     )
 
 
@@ -151,7 +193,14 @@ def _error_scale(options: RemoteEstimationOptions, deviation: Array) -> Array:
         single = (6.0 * _USUAL_PRICE) ** 0.25
         shared = math.sqrt(sensors) if options.access != "any" else 1.0
         return deviation * max(single, shared)
-    steps = float(bucket.cost.sum()) / max(bucket.rate, 1e-3)
-    if options.access != "any":
-        steps = max(steps, float(sensors))
-    return deviation * math.sqrt(max(steps, 1.0))
+    return deviation * np.sqrt(_steps(options, sensors))
+
+
+def _steps(options: RemoteEstimationOptions, sensors: int) -> Array:
+    """Return the steps between two packets of a sensor, at least 1, that the network sustains."""
+    bucket, least = (
+        make_bucket(options, sensors),
+        float(sensors) if options.access != "any" else 1.0,
+    )
+    steps = 0.0 if bucket.unlimited else bucket.round_cost / np.maximum(bucket.rate, 1e-3)
+    return np.maximum(np.ravel(steps), least)

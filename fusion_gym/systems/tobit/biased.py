@@ -97,9 +97,9 @@ class BiasedOscillatorOptions(FeedbackOptions):
     censors."""
     access: AccessRule = "single"
     tokens: Tokens = "unlimited"
-    token_rate: float = 1.0
-    token_capacity: float = 15.0
-    initial_tokens: float = 6.0
+    token_rate: ArrayLike = 1.0
+    token_capacity: ArrayLike = 15.0
+    initial_tokens: ArrayLike = 6.0
     filter: Annotated[str, _FILTERS] = "paper"
     """Filter of the nodes. ``"paper"`` is the Tobit Kalman filter of equations (18)-(25),
     corrected. ``"kalman"`` ignores censoring. ``"adf"`` is one assumed-density filter at the

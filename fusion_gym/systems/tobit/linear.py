@@ -231,9 +231,9 @@ class LinearFusionOptions(FeedbackOptions):
     """Upper limit υ: one number, one per sensor, or a list for each sensor with one per channel."""
     reward_scale: float | Literal["auto"] | None = "auto"
     cost_weight: float | Literal["random"] = 0.5
-    token_rate: float = 1.0
-    token_capacity: float = 15.0
-    initial_tokens: float = 6.0
+    token_rate: ArrayLike = 1.0
+    token_capacity: ArrayLike = 15.0
+    initial_tokens: ArrayLike = 6.0
     filter: Annotated[str | None, _FILTERS] = None
     """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
     ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one

@@ -1,0 +1,229 @@
+"""Schedules by age: the Whittle index, the optimum of two sources, maximum age first."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.ages import AgeIndex, AgeOptimum
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.solvers import SourceProblem, age_index, age_sources, solve_ages
+from fusion_gym.solvers.ages import AgeSource
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[Any]
+TWO: dict[str, Any] = {"channel": "gilbert_elliott", "error": "trace", "cost_weight": 0.0}
+
+
+def make(count: int, **options: Any) -> Task:
+    """Drawn sources that share one slot."""
+    chosen: dict[str, Any] = {"sources": (count, 0), "access": "slots"}
+    return fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", **chosen | TWO | options)
+
+
+@pytest.mark.parametrize("drop", [0.0, 0.3, 0.6])
+def test_the_index_of_an_age_is_that_of_kadota(drop: float) -> None:
+    """s a (a - 1)/2 + a for costs that are ages: I. Kadota, A. Sinha, E. Uysal-Biyikoglu, R. Singh
+    and E. Modiano, IEEE/ACM Trans. Networking 26, 2018."""
+    index = age_index(np.arange(61.0), np.array([drop]), np.ones((1, 1)))[:15, 0]
+    age = np.arange(1, 16)
+    np.testing.assert_allclose(index, (1.0 - drop) * age * (age - 1) / 2 + age, rtol=1e-4)
+
+
+def test_at_the_index_both_decisions_cost_the_same() -> None:
+    """By value iteration of a separate program, for a Gilbert-Elliott channel."""
+    drop, move = np.array([0.7, 0.2]), np.array([[0.7, 0.3], [0.1, 0.9]])
+    costs = 0.5 + np.cumsum(1.1 ** (2.0 * np.arange(21)))
+    index = age_index(costs, drop, move)
+    assert (np.diff(index, axis=0) > 0.0).all()
+    assert (index[:, 1] > index[:, 0]).all()
+    for age, state in ((2, 0), (4, 1), (9, 0)):
+        price, value = index[age - 1, state], {}
+        places = [(k, s) for k in range(1, 21) for s in (0, 1)]
+        value = dict.fromkeys(places, 0.0)
+        for _ in range(4000):
+            both = {p: decisions(value, costs, drop, move, price, *p) for p in places}
+            new = {p: min(pair) for p, pair in both.items()}
+            value = {p: 0.5 * value[p] + 0.5 * (new[p] - new[1, 0]) for p in places}
+        silent, sent = decisions(value, costs, drop, move, price, age, state)
+        assert silent == pytest.approx(sent, rel=1e-5)
+
+
+def decisions(
+    value: dict[tuple[int, int], float],
+    costs: Array,
+    drop: Array,
+    move: Array,
+    price: float,
+    age: int,
+    state: int,
+) -> tuple[float, float]:
+    """The costs to go of silence and of a transmission."""
+    silent, sent, older = 0.0, price, min(age + 1, len(costs) - 1)
+    for after in (0, 1):
+        late = costs[age] + value[older, after]
+        silent += move[state, after] * late
+        fresh = costs[0] + value[1, after]
+        sent += move[state, after] * (drop[after] * late + (1.0 - drop[after]) * fresh)
+    return silent, sent
+
+
+def least_cost(sources: tuple[AgeSource, ...]) -> float:
+    """The optimum of two sources on one channel, by loops over the states."""
+    longest = len(sources[0].costs) - 1
+    ages, states = range(1, longest + 1), range(len(sources[0].drop))
+    value = np.zeros((longest + 1, len(states), longest + 1, len(states)))
+    change = np.zeros_like(value)
+    for _ in range(600):
+        new = np.zeros_like(value)
+        moves = []
+        for i, source in enumerate(sources):
+            # E over the channel's next state, as functions of (age, last state).
+            t, d = source.transition, source.drop
+            late = np.zeros((longest + 1, len(states), longest + 1, len(states)))
+            for k in ages:
+                for s in states:
+                    for after in states:
+                        late[k, s, min(k + 1, longest), after] += t[s, after]
+            fresh = np.zeros_like(late)
+            for k in ages:
+                for s in states:
+                    for after in states:
+                        fresh[k, s, min(k + 1, longest), after] += t[s, after] * d[after]
+                        fresh[k, s, 1, after] += t[s, after] * (1.0 - d[after])
+            stay = np.array([[source.costs[k] for _ in states] for k in range(longest + 1)])
+            loss = np.array([t[s] @ d for s in states])
+            sent = source.price + loss * stay + (1.0 - loss) * source.costs[0]
+            moves.append(((late, stay), (fresh, sent)))
+            assert i < 2
+        options = []
+        for first, second in ((0, 0), (1, 0), (0, 1)):
+            (p, c), (q, e) = moves[0][first], moves[1][second]
+            ahead = np.einsum("ksxy,xyuv,mnuv->ksmn", p, value, q)
+            options.append(ahead + c[:, :, None, None] + e[None, None])
+        new = np.minimum.reduce(options)
+        change = (new - value)[1:, :, 1:]
+        value = value + 0.7 * (new - value - (new - value)[1, 0, 1, 0])
+        if np.ptp(change) < 1e-9:
+            break
+    return float(change.mean())
+
+
+def test_the_optimum_of_two_sources_is_that_of_a_separate_program() -> None:
+    task = make(2)
+    policy = AgeOptimum(task, longest=12)
+    assert policy.solution.lower <= policy.solution.upper
+    assert policy.solution.cost == pytest.approx(least_cost(age_sources(task, 12)), rel=1e-6)
+
+
+def test_more_ages_bring_the_bounds_of_the_optimum_together() -> None:
+    """Each pair contains all pairs of more ages."""
+    solutions = [AgeOptimum(make(2), longest=longest).solution for longest in (5, 10, 20, 40)]
+    lower, upper = [item.lower for item in solutions], [item.upper for item in solutions]
+    assert lower == sorted(lower)
+    assert upper == sorted(upper, reverse=True)
+    assert lower[3] == pytest.approx(upper[3], rel=1e-6)
+    assert upper[0] > 1.05 * lower[0]
+
+
+@pytest.mark.parametrize("drop", [0.0, 0.3])
+@pytest.mark.parametrize("coefficient", [0.9, 1.0, 1.2])
+def test_the_bounds_of_one_source_hold_for_all_ages(coefficient: float, drop: float) -> None:
+    """Few ages bound the optimum of many."""
+    problem = SourceProblem.create(coefficient=coefficient, price=4.0, drop=drop)
+    few, many = (solve_ages((AgeSource.of_scalar(problem, longest),), 1) for longest in (4, 40))
+    assert few.lower <= many.cost * (1.0 + 1e-7)
+    assert few.upper >= many.cost * (1.0 - 1e-7)
+    assert many.upper == pytest.approx(many.lower, rel=1e-6)
+
+
+def test_rules_by_age_cost_at_least_the_optimum() -> None:
+    """On the same noise; the optimum's cost is the solver's, but for the start at age 0."""
+    task = make(2, horizon=400)
+    names = ("age_optimum", "age_index", "information_gain:threshold=0", "maximum_age")
+    returns = [-run_episodes(task, make_policy(name, task), 200).returns / 400 for name in names]
+    optimum = AgeOptimum(task).solution.cost
+    deviation = returns[0].std() / 200**0.5
+    assert returns[0].mean() == pytest.approx(optimum, abs=4.0 * deviation + 0.005 * optimum)
+    for other in returns[1:]:
+        gain = other - returns[0]
+        assert gain.mean() > -2.0 * gain.std() / 200**0.5
+    assert (returns[3] - returns[0]).mean() > 4.0 * returns[3].std() / 200**0.5
+
+
+def test_the_index_asks_only_where_the_price_is_worth_it() -> None:
+    task = make(3, cost_weight=40.0)
+    free, priced = (AgeIndex(task, price=price) for price in (0.0, 40.0))
+    rates = [run_episodes(task, policy, 20).rate.mean() for policy in (free, priced)]
+    assert rates[0] == pytest.approx(1.0 / 3.0)
+    assert 0.05 < rates[1] < 0.8 * rates[0]
+
+
+def test_the_oldest_sensor_is_first() -> None:
+    task = make(3, channel="perfect", drop_probability=None)
+    results = run_episodes(task, make_policy("maximum_age", task), 3)
+    assert results.rate.mean() == pytest.approx(1.0 / 3.0)
+    late = make_policy("maximum_age:least=10,at_most=none", task)
+    assert run_episodes(task, late, 3).rate.mean() == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("age_index", {"sources": None}, "vector sources"),
+        ("age_optimum", {"sources": None}, "vector sources"),
+        ("age_optimum", {"tokens": "limited"}, "tokens = 'limited'"),
+        ("age_optimum", {"access": "assignment"}, "access = 'assignment'"),
+        ("age_optimum:longest=40", {"sources": (3, 0)}, "300000"),
+        ("age_index:longest=1", {}, "longest = 1"),
+        ("age_index:price=-1", {}, "price = -1"),
+        (
+            "age_index",
+            {"channel": "independent", "drop_probability": 0.97},
+            r"sources\[0\] .* infinite",
+        ),
+    ],
+)
+def test_what_has_no_schedule_by_age_is_refused(
+    name: str, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        make_policy(name, make(2, **options))
+
+
+@pytest.mark.parametrize("myopic", [False, True])
+def test_the_highest_index_of_a_pair_is_assigned_first(myopic: bool) -> None:
+    """To its channel, and then the highest of the sensors and channels that are left."""
+    task = make(4, access="assignment", channels=2)
+    policy, batch = AgeIndex(task, myopic=myopic), EpisodeBatch.seeded(task, 6, 0)
+    for _ in range(12):
+        signals = batch.signals()
+        requests, age, states = policy(signals), signals["age"], signals["channel_state"]
+        for run in range(6):
+            pairs = {
+                (i, c): policy.tables[2 * i + c][min(int(age[i, run]), 40) - 1, states[i, c, run]]
+                for i in range(4)
+                for c in range(2)
+            }
+            expected = np.zeros(4, dtype=int)
+            while pairs:
+                sensor, channel = max(pairs, key=pairs.__getitem__)
+                expected[sensor] = channel + 1
+                pairs = {p: v for p, v in pairs.items() if sensor != p[0] and channel != p[1]}
+            np.testing.assert_array_equal(requests[:, run], expected)
+        np.testing.assert_array_equal(batch.step(requests).granted, requests > 0)
+
+
+def test_an_index_by_channel_beats_rules_without_channels() -> None:
+    task = make(6, access="assignment", channels=2)
+    names = ("age_index", "age_index:myopic=true", "information_gain:threshold=0,at_most=2")
+    returns = [run_episodes(task, make_policy(name, task), 200).returns for name in names]
+    for better, worse in pairwise(returns):
+        gain = better - worse
+        assert gain.mean() > 3.0 * gain.std() / 200**0.5
