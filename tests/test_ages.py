@@ -173,6 +173,21 @@ def test_the_oldest_sensor_is_first() -> None:
     assert run_episodes(task, late, 3).rate.mean() == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.parametrize("access", [{"slots": 1}, {"access": "assignment", "channels": 1}])
+def test_the_index_passes_over_sensors_without_energy(access: dict[str, Any]) -> None:
+    """No slot is lost to a sensor whose battery is empty."""
+    battery = {"tokens": "limited", "budget": "sensor", "harvest": "bernoulli"}
+    numbers = {"token_rate": 0.2, "token_capacity": 4.0, "initial_tokens": 1.0}
+    task = make(4, **battery | numbers | access)
+    batch, policy, empty = EpisodeBatch.seeded(task, 50, 0), AgeIndex(task), 0
+    for _ in range(40):
+        able = batch.grantable()
+        granted = batch.step(policy(batch.signals())).granted
+        np.testing.assert_array_equal(granted.any(0), able.any(0))
+        empty += int((~able).sum())
+    assert empty
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [

@@ -50,9 +50,9 @@ class AgeIndex(Stateless):
         $$
 
         a are the steps since the last delivery, s the channel's last state, c the tokens of a
-        transmission, p is ``price``; at most ``at_most`` sources, by the highest index. With
-        ``access="assignment"`` every pair of sensor and channel has an index, and the highest ones
-        are assigned first.
+        transmission, which the sensor must have, p is ``price``; at most ``at_most`` sources, by
+        the highest index. With ``access="assignment"`` every pair of sensor and channel has an
+        index, and the highest ones are assigned first.
 
     Assumes: a model that is true. The index uses no measurement.
 
@@ -97,7 +97,8 @@ class AgeIndex(Stateless):
         states = channel.reshape(len(self.tables), -1)
         parts = zip(self._sources, self.tables, age.repeat(links, axis=0), states, strict=True)
         index = np.stack([table[_places(source, a), s] for source, table, a, s in parts])
-        worth = index >= self._price * self._cost.repeat(links, axis=0)
+        grantable = signals["grantable"].repeat(links, axis=0)
+        worth = grantable & (index >= self._price * self._cost.repeat(links, axis=0))
         if not self._by_channel:
             return strongest(index, worth, self._at_most, age)
         shape = (len(age), links, age.shape[-1])
