@@ -167,8 +167,13 @@ def test_the_index_asks_only_where_the_price_is_worth_it() -> None:
 
 def test_the_oldest_sensor_is_first() -> None:
     task = make(3, channel="perfect", drop_probability=None)
-    results = run_episodes(task, make_policy("maximum_age", task), 3)
-    assert results.rate.mean() == pytest.approx(1.0 / 3.0)
+    policy, batch = make_policy("maximum_age", task), EpisodeBatch.seeded(task, 5, 0)
+    batch.step(np.random.default_rng(0).random((3, 5)) < 0.5)
+    for _ in range(6):
+        age, requests = batch.signals()["age"], policy(batch.signals())
+        assert (requests.sum(0) == 1).all()
+        assert (age[requests.argmax(0), np.arange(5)] == age.max(0)).all()
+        batch.step(requests)
     late = make_policy("maximum_age:least=10,at_most=none", task)
     assert run_episodes(task, late, 3).rate.mean() == pytest.approx(0.1, abs=0.01)
 
