@@ -367,7 +367,7 @@ def make_network(options: CommonOptions, sensors: int) -> Network:
         options.access,
         make_channel(options, sensors),
         make_delay(options),
-        acknowledgement=acknowledgement(options.acknowledgements),
+        acknowledgement=make_acknowledgement(options.acknowledgements),
         slots=options.channels if rule.by_channel else options.slots,
         channels=options.channels,
         discrepancy=options.discrepancy,
@@ -375,7 +375,7 @@ def make_network(options: CommonOptions, sensors: int) -> Network:
     )
 
 
-def acknowledgement(value: str | float | None) -> float:
+def make_acknowledgement(value: str | float | None) -> float:
     """Return the probability that the sender of a packet learns whether it arrives."""
     allowed = "'perfect', 'none' or a number from 0 to 1"
     if value is None or isinstance(value, str):

@@ -108,9 +108,9 @@ def _growth(costs: Array) -> float:
 class AgeSolution:
     """The least average cost per step of policies of all ages, between ``lower`` and ``upper``.
 
-    ``upper`` is infinite for more than two sources. ``cost`` is that with ages up to K. ``choice``
-    is the set of sources to transmit, as bits, by each source's age 1 to K and last channel state,
-    (K, S, K, S, …).
+    ``upper`` is infinite for more than two sources, and for two that may transmit together.
+    ``cost`` is that with ages up to K. ``choice`` is the set of sources to transmit, as bits, by
+    each source's age 1 to K and last channel state, (K, S, K, S, …).
     """
 
     cost: float

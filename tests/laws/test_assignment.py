@@ -317,7 +317,7 @@ def test_agents_learn_and_are_loaded(learner: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("options", [{}, SCARCE, {"memory": True}], ids=str)
 def test_credit_of_a_channel_is_that_of_its_alternatives(options: dict[str, Any]) -> None:
-    """Each stepped by itself on the same noise."""
+    """Each is stepped alone on the same noise."""
     env = PrivilegedVecEnv(task_of(**ASSIGNED | options), RUNS)
     env.seed(0)
     env.reset()

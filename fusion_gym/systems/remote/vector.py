@@ -15,10 +15,9 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
 from fusion_gym.core.nature import Nature, true_motion, true_noise
-from fusion_gym.core.plant import Plant
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
-from fusion_gym.systems.parts import RANGE, Deliveries, Truth, numbered_states
+from fusion_gym.systems.parts import RANGE, Deliveries, NormalPlant, Truth, numbered_states
 
 KEYS = ("transition", "process_covariance", "measurement_matrix", "measurement_covariance")
 _FLOOR = 1e-12  # of a deviation, in process deviations: zero could not divide
@@ -104,7 +103,7 @@ def _padded(blocks: Sequence[NDArray[Any]]) -> Array:
 
 
 @dataclass(frozen=True)
-class VectorSources(Plant[Truth]):
+class VectorSources(NormalPlant):
     """l independent sources with s states and m channels at most; x(0) ~ N(0, P̄).
 
     Shapes: ``transition`` (l, s, s, 1), ``process_factor`` (l, s, s, 1), ``measurement_matrix``
@@ -216,17 +215,6 @@ class VectorSources(Plant[Truth]):
         moved = linalg.matmul(self.transition, covariance)
         moved = linalg.matmul(moved, linalg.transpose(self.transition))
         return moved + linalg.gram(self.process_factor)
-
-    @property
-    def draw_channels(self) -> int:
-        """Number of states."""
-        return len(self.state_names)
-
-    def draw(
-        self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
-    ) -> Truth:
-        """Draw the truth from N(mean, covariance)."""
-        return Truth(linalg.draw_normal(mean, covariance, noise), measurement, None)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without a delivery."""
