@@ -9,7 +9,7 @@ rows of a run), ``knowledge`` (class of a row), ``local`` (whether each row belo
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
@@ -24,7 +24,7 @@ from fusion_gym.errors import ConfigurationError, display, refusal
 
 Rows = NDArray[np.float32]
 Requests = NDArray[np.bool_]
-Actions = spaces.MultiBinary | spaces.MultiDiscrete | spaces.Discrete[Any]
+Actions: TypeAlias = "spaces.MultiBinary | spaces.MultiDiscrete | spaces.Discrete[Any]"
 
 
 class SchedulerView:
