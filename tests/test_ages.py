@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scalar_ages import by_age
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -13,8 +14,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.ages import AgeIndex, AgeOptimum
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.solvers import SourceProblem, age_index, age_sources, solve_ages
-from fusion_gym.solvers.ages import AgeSource
+from fusion_gym.solvers import AgeSource, SourceProblem, age_index, age_sources, solve_ages
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[Any]
@@ -137,7 +137,7 @@ def test_more_ages_bring_the_bounds_of_the_optimum_together() -> None:
 def test_the_bounds_of_one_source_hold_for_all_ages(coefficient: float, drop: float) -> None:
     """Few ages bound the optimum of many."""
     problem = SourceProblem.create(coefficient=coefficient, price=4.0, drop=drop)
-    few, many = (solve_ages((AgeSource.of_scalar(problem, longest),), 1) for longest in (4, 40))
+    few, many = (solve_ages((by_age(problem, longest),), 1) for longest in (4, 40))
     assert few.lower <= many.cost * (1.0 + 1e-7)
     assert few.upper >= many.cost * (1.0 - 1e-7)
     assert many.upper == pytest.approx(many.lower, rel=1e-6)

@@ -1,6 +1,7 @@
 """The benchmark: prices, searched rules, agents, verdict, pages and the zoo made from it."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,39 @@ def test_from_prices_to_pages_and_zoo(
     assert {f"{point['cost']:.4g}" for point in card["test"]["points"]} <= costs
 
 
+def test_the_suite_of_channels_tests_each_rule_and_agents_that_assign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = yaml.safe_load(settings.FILE.with_stem("channels").read_text())
+    for setting in content["settings"]:
+        setting["options"] |= {"horizon": 12}
+        setting |= {"num_envs": 8, "cases": setting.get("cases", [])[:1]}
+    small = {name: value for name, value in SMALL.items() if name not in ("rules", "cases")}
+    (tmp_path / "channels.yaml").write_text(yaml.safe_dump(content | small | {"steps": 1e-4}))
+    monkeypatch.setattr(settings, "FILE", tmp_path / "settings.yaml")
+    monkeypatch.chdir(tmp_path)
+    succeed("benchmark", ["--suite", "channels", "--workers", "1"])
+    folder = tmp_path / "results" / "channels"
+    rows, page = read_rows(folder, evidence.TestRow), (folder / "README.md").read_text()
+    for setting in content["settings"]:
+        costs = {
+            kind: [row.cost for row in rows if (row.setting, row.kind) == (setting["name"], kind)]
+            for kind in ("trigger", *setting["named_rules"], "agent", "learned", "other")
+        }
+        assert {kind: len(own) for kind, own in costs.items()} == {
+            kind: 5 * (2 if kind in ("agent", "learned", "other") else 1) for kind in costs
+        }
+        assert (costs["agent"] == costs["learned"]) == (setting["name"] == "many_plants")
+        assert all(
+            re.search(rf"\| {setting['title']} +\| {kind} +\|", page)
+            for kind in setting["named_rules"]
+        )
+    assert "](../../docs/benchmark.md)" in page
+    assert {row.name for row in rows} == {"centre", "scheduler"}
+    algorithms = {row.algorithm for row in read_rows(folder, evidence.TrainingRow)}
+    assert algorithms == {"counterfactual_ppo", "maskable_ppo"}
+
+
 def test_a_policy_of_ones_own_has_the_same_verdict(small: list[str]) -> None:
     text = "value_of_information:price={price}"
     printed = succeed("benchmark", [*small, "--policy", text, "--class", "scheduler"]).out
@@ -215,8 +249,11 @@ def test_prices_are_slopes_of_the_front(monkeypatch: pytest.MonkeyPatch) -> None
     assert prices == pytest.approx([share**-2 for share in shares], rel=0.02)
 
 
-def test_all_tasks_and_rules_of_the_benchmark_exist(monkeypatch: pytest.MonkeyPatch) -> None:
-    suite, tasks, make = load_suite(), {}, settings.Setting.task
+@pytest.mark.parametrize(("name", "count"), [("settings", 8), ("channels", 2)])
+def test_all_tasks_and_rules_of_the_benchmark_exist(
+    name: Any, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite, tasks, make = load_suite(name=name), {}, settings.Setting.task
 
     def task_once(setting: Any, name: Any, case: Any = None) -> Any:
         key = setting.name, setting.has_memory(name), case and case.name
@@ -224,9 +261,9 @@ def test_all_tasks_and_rules_of_the_benchmark_exist(monkeypatch: pytest.MonkeyPa
         return tasks[key]
 
     monkeypatch.setattr(settings.Setting, "task", task_once)
-    assert len(suite.settings) == 8
+    assert len(suite.settings) == count
     for setting in suite.settings:
-        for name in CLASSES:
+        for name in setting.classes:
             own = rules.rules_of(setting, name, suite.rules)
             assert len(own) >= 4
             for rule in own:

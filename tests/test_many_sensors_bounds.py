@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scalar_ages import by_age
 
 import fusion_gym
 from fusion_gym.core.task import Task
@@ -11,7 +12,7 @@ from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.solvers import AgeSource, solve_ages, solve_task
+from fusion_gym.solvers import solve_ages, solve_task
 from fusion_gym.solvers.source import TokenLevels
 from fusion_gym.solvers.task import source_problems
 from fusion_gym.training.counterfactual import Decisions
@@ -69,7 +70,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
         r"sensors = 13 .*at most 12.*2\^13",
     ),
     "ages": (
-        lambda: solve_ages(tuple(AgeSource.of_scalar(p, 1) for p in source_problems(sources(60)))),
+        lambda: solve_ages(tuple(by_age(p, 1) for p in source_problems(sources(60)))),
         r"60 sources.*2\^60",
     ),
     "sensors": (lambda: sources(1001), r"sensors = 1001.*<= 1000"),

@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rules import make_rule
+from scalar_ages import by_age
 from scipy.optimize import minimize_scalar
 
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.solvers.ages import AgeSource, solve_ages
+from fusion_gym.solvers.ages import solve_ages
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import (
     lagrangian_bound,
@@ -141,13 +142,13 @@ def test_best_age_rule_of_one_source_is_the_best_period(a: float, price: float) 
     if a < 1.0:
         best = min(best, 1.0 / (1.0 - a * a))  # never
     problem = SourceProblem.create(coefficient=a, price=price)
-    assert solve_ages((AgeSource.of_scalar(problem),)).cost == pytest.approx(best, rel=1e-4)
+    assert solve_ages((by_age(problem),)).cost == pytest.approx(best, rel=1e-4)
 
 
 def test_round_robin_is_the_best_schedule_by_ages_of_equal_sources_only() -> None:
-    free = AgeSource.of_scalar(SourceProblem.create(price=0.0), sharing=3.0)
+    free = by_age(SourceProblem.create(price=0.0), sharing=3.0)
     assert solve_ages((free,) * 3, at_most=1).cost == pytest.approx(3.0, rel=1e-6)  # 0 + 1 + 2
-    wild = AgeSource.of_scalar(SourceProblem.create(price=0.0, deviation=4.0), sharing=3.0)
+    wild = by_age(SourceProblem.create(price=0.0, deviation=4.0), sharing=3.0)
     uneven = solve_ages((wild, free), at_most=1).cost
     # Round robin costs 16/2 + 1/2; the calm source waits for τ steps, the wild one once.
     assert uneven == pytest.approx(
@@ -159,7 +160,7 @@ def test_round_robin_is_the_best_schedule_by_ages_of_equal_sources_only() -> Non
 def test_losses_in_the_best_schedule_by_ages() -> None:
     """Always transmitting is best at price zero: the age is then geometric."""
     problem = SourceProblem.create(price=0.0, drop=0.4)
-    assert solve_ages((AgeSource.of_scalar(problem),)).cost == pytest.approx(0.4 / 0.6, rel=1e-5)
+    assert solve_ages((by_age(problem),)).cost == pytest.approx(0.4 / 0.6, rel=1e-5)
 
 
 # --- tokens --------------------------------------------------------------------------------------
@@ -304,8 +305,7 @@ def test_joint_optimum_lies_between_the_dual_bound_and_the_best_schedule(drop: f
     )
     bound = lagrangian_bound(sources, (1.0, 1.0), 1.0).cost
     joint = solve_joint_average(JointProblem.create(sources, at_most=1))
-    by_age = tuple(AgeSource.of_scalar(source, sharing=2.0) for source in sources)
-    ages = solve_ages(by_age, at_most=1).cost
+    ages = solve_ages(tuple(by_age(source, sharing=2.0) for source in sources), at_most=1).cost
     assert bound < joint.cost < ages
     assert ages > 1.4 * joint.cost
     # With one packet a step the larger error goes first where all else is equal.
@@ -384,7 +384,7 @@ BUCKET = TokenBucket.create(0.5, 2.0, 0.0, 1.0, sensors=1)
         (lambda: solve_finite(PLAIN, 0), "horizon"),
         (lambda: JointProblem.create((PLAIN,) * 3), "sensors = 3"),
         (lambda: JointProblem.create((PLAIN, STATES)), "independently"),
-        (lambda: solve_ages((AgeSource.of_scalar(PLAIN, 40),) * 4), "300000"),
+        (lambda: solve_ages((by_age(PLAIN, 40),) * 4), "300000"),
         (lambda: lagrangian_bound((SourceProblem.create(bucket=BUCKET),), (1.0,), 0.5), "tokens"),
     ],
 )

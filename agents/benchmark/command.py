@@ -1,6 +1,7 @@
 """The benchmark: rules and agents of three classes in eight settings, at equal price.
 
     python -m agents.benchmark --quick --workers 2
+    python -m agents.benchmark --suite channels
     python -m agents.benchmark --policy 'value_of_information:price={price}' --class scheduler
 
 In every class it freezes five prices, tunes the rules of the literature, searches one rule for all
@@ -27,7 +28,7 @@ from agents.benchmark.evidence import (
 )
 from agents.benchmark.jobs import Runner
 from agents.benchmark.report import print_classes, write_results
-from agents.benchmark.settings import ClassName, load_suite
+from agents.benchmark.settings import ClassName, SuiteName, load_suite
 from agents.workers import BackendName, Pool
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.options import OUTPUT_FOLDER, whole, writable_folder
@@ -43,6 +44,8 @@ class Benchmark(Long):
 
     program = "python -m agents.benchmark"
 
+    suite: SuiteName = "settings"
+    """Eight settings, or two with channels and batteries."""
     settings: tuple[str, ...] = ()
     """Settings by name; all by default."""
     quick: bool = False
@@ -52,7 +55,8 @@ class Benchmark(Long):
     class_name: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
     """Class of the policy."""
     results: Annotated[Path | None, OUTPUT_FOLDER] = None
-    """Folder for tables, figures and README.md: results, or runs/benchmark/results with --quick."""
+    """Folder for tables, figures and README.md: results, results/channels, or with --quick
+    runs/benchmark/quick/results."""
     work: Annotated[Path, OUTPUT_FOLDER] = Path("runs/benchmark")
     """Folder for finished pieces of work and agents."""
     workers: Annotated[int, whole(1, 512)] = 2
@@ -66,12 +70,13 @@ class Benchmark(Long):
         """Run unfinished work, and write the results."""
         if (self.policy is None) != (self.class_name is None):
             raise refusal("class", self.class_name, "given if and only if --policy is given")
-        suite = load_suite(self.quick, self.settings)
+        suite = load_suite(self.quick, self.settings, self.suite)
         if self.policy is not None and self.class_name is not None:
             check_policy(suite, self.policy, self.class_name)
         pool = Pool(self.workers, self.backend, self.address)
         work = self.work / ("quick" if self.quick else "full")
         folder = self.results or (work / "results" if self.quick else Path("results"))
+        folder = folder if self.results or self.suite == "settings" else folder / self.suite
         writable_folder("results", folder)
         with ended_like_by_ctrl_c(), lock_folder(work, "work"):
             runner = Runner(work.absolute(), pool)

@@ -14,7 +14,6 @@ import numpy as np
 from agents.benchmark.jobs import Runner
 from agents.benchmark.rules import SearchJob, SweepJob, SweepResult, rules_of, run_search, run_sweep
 from agents.benchmark.settings import (
-    CLASSES,
     Case,
     ClassName,
     Setting,
@@ -191,11 +190,9 @@ def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     return classes
 
 
-def find_prices(
-    suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASSES
-) -> list[Evidence]:
-    """Tune the rules with one threshold, and freeze the prices of the classes."""
-    places = [(setting, name) for setting in suite.settings for name in names]
+def find_prices(suite: Suite, runner: Runner, only: ClassName | None = None) -> list[Evidence]:
+    """Tune the rules with one threshold, and freeze the prices of the classes or of one."""
+    places = [(s, name) for s in suite.settings for name in ([only] if only else s.classes)]
     jobs = [
         SweepJob(*place, rules_of(*place, suite.rules), suite.shares, suite.tuning_episodes)
         for place in places
@@ -253,9 +250,10 @@ def policies_of(item: Evidence) -> Iterator[tuple[str, list[str]]]:
     count = len(item.prices)
     yield REFERENCE, [item.priced_rule] * count
     yield "threshold", [item.sweep.best(price).policy for price in item.prices]
-    trigger = item.setting.trigger.policy
-    if any(tuned.rule == trigger for tuned in item.sweep.tuned):
-        yield "trigger", [item.sweep.best(price, trigger).policy for price in item.prices]
+    tuned = {row.rule for row in item.sweep.tuned}
+    for kind, rule in {"trigger": item.setting.trigger, **item.setting.named_rules}.items():
+        if rule.policy in tuned:
+            yield kind, [item.sweep.best(price, rule.policy).policy for price in item.prices]
     if item.setting.optimum is not None and item.name == "scheduler":
         yield "optimum", [item.setting.optimum] * count
     for kind, every in item.trainings.items():
@@ -294,7 +292,7 @@ def check_policy(suite: Suite, text: str, name: ClassName) -> None:
 
 def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) -> list[Evidence]:
     """Test a policy in a class of every setting, together with the searched rule."""
-    classes = find_prices(suite, runner, (name,))
+    classes = find_prices(suite, runner, name)
     find_rules(suite, runner, classes)
     places = [
         (item, kind, [policy] * len(item.prices))

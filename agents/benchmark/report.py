@@ -101,11 +101,13 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
     draw_headline(results, titles, folder / "readme.png")
     headline = headline_text(suite.settings, results.savings)
     short, long = suite.training_seeds
+    command = "make benchmark" if folder == Path("results") else "python -m agents.benchmark"
+    named = {kind for setting in suite.settings for kind in setting.named_rules}
     page = [
         "# Benchmark",
-        f"Results of `make benchmark` in version {__version__}: {suite.episodes:,} test episodes, "
+        f"Results of `{command}` in version {__version__}: {suite.episodes:,} test episodes, "
         f"{long} trainings of an agent, {short} where one takes less than a minute. "
-        "[Method](../docs/benchmark.md).",
+        f"[Method]({'../' * len(folder.parts)}docs/benchmark.md).",
         headline,
         "## Against the searched rule",
         "Cost over the searched rule's, %: mean over five prices, seeds and episodes; negative: "
@@ -114,9 +116,16 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
         class_table(titles, results),
         "\n".join(f"- {text}" for text in sentences(results)),
         "## What credit and calibration add",
-        "Stable-Baselines3's PPO and counterfactual credit with the same processor time, alone and "
-        "calibrated. Seconds of one training; cost over the searched rule's, %.",
+        f"Counterfactual credit and `{suite.comparison.algorithm.name}` with the same processor "
+        "time, alone and calibrated. Seconds of one training; cost over the searched rule's, %.",
         comparison_table(titles, results),
+        "## Rules of the literature" if named else "",
+        table(
+            ("setting", "rule with one tuned threshold", "cost over the searched rule's, %"),
+            ((titles[r.setting], r.kind, mean_text(r)) for r in results.classes if r.kind in named),
+        )
+        if named
+        else "",
         "## Searched rules",
         table(
             ("setting", "class", "policy"),
@@ -137,7 +146,7 @@ def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> No
             for name, title in titles.items()
         ),
     ]
-    write_text(folder / "README.md", "\n\n".join(page) + "\n")
+    write_text(folder / "README.md", "\n\n".join(filter(None, page)) + "\n")
     if folder == Path("results"):
         text = README.read_text(encoding="utf-8")
         part = f"<!-- results: headline -->\n{headline}\n<!-- end -->"

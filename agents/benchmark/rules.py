@@ -117,7 +117,7 @@ def rules_of(
     """Return the rules whose declared knowledge the class covers."""
     knower = knowledge_of(setting, name)
     result = []
-    for rule in dict.fromkeys((setting.trigger, *setting.more_rules, *rules)):
+    for rule in dict.fromkeys((setting.trigger, *setting.named_rules.values(), *rules)):
         try:
             task = setting.task(name, rule.case)
             policy = make_policy(rule.policy.format(value=rule.ends[0]), task)

@@ -21,6 +21,7 @@ from fusion_gym.training.config import (
 from fusion_gym.validation import choice
 
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)
+SuiteName = Literal["settings", "channels"]
 FILE = Path(__file__).with_name("settings.yaml")
 SHORT = 60  # seconds of a short training
 
@@ -50,7 +51,8 @@ class ThresholdRule(Strict):
 class Setting(Strict):
     """An environment with options, its own trigger, and the length of its trainings.
 
-    ``optimum`` is a policy with ``{price}``, ``seconds`` about the length of a training in a class.
+    ``named_rules`` are tested by their titles like the trigger. ``optimum`` is a policy with
+    ``{price}``, ``seconds`` about the length of a training in a class.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -59,7 +61,8 @@ class Setting(Strict):
     options: Options
     trigger: ThresholdRule
     trigger_title: str
-    more_rules: tuple[ThresholdRule, ...] = ()
+    named_rules: dict[str, ThresholdRule] = pydantic.Field(default_factory=dict)
+    classes: tuple[ClassName, ...] = CLASSES
     agent_options: Options = pydantic.Field(default_factory=dict)
     memory: bool = True
     optimum: str | None = None
@@ -68,6 +71,11 @@ class Setting(Strict):
     num_envs: Positive = 1024
     error: Literal["squared", "excess", "mismatch"] = "mismatch"
     cases: tuple[Case, ...] = ()
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether agents are calibrated: they have a logit for each sensor."""
+        return self.options.get("access") != "assignment"
 
     def has_memory(self, name: ClassName) -> bool:
         """Return whether the policies of a class have memory."""
@@ -94,10 +102,10 @@ class Setting(Strict):
 
 
 class OtherAlgorithm(Strict):
-    """Another algorithm, in one class of some settings, with a factor of each one's time steps."""
+    """Another algorithm, in classes of some settings, with a factor of each one's time steps."""
 
     algorithm: AnyAlgorithm
-    name: ClassName
+    names: tuple[ClassName, ...]
     steps: dict[str, Rate]
 
 
@@ -135,7 +143,7 @@ class Suite(Strict):
     ) -> dict[str, tuple[AnyAlgorithm, float]]:
         """Return the algorithms of a class by kind, each with the factor of its time steps."""
         result: dict[str, tuple[AnyAlgorithm, float]] = {"agent": (self.algorithm, 1.0)}
-        if name == self.comparison.name and setting.name in self.comparison.steps:
+        if name in self.comparison.names and setting.name in self.comparison.steps:
             result["other"] = self.comparison.algorithm, self.comparison.steps[setting.name]
         return result
 
@@ -170,16 +178,19 @@ class Suite(Strict):
         )
 
 
-def load_suite(quick: bool = False, settings: tuple[str, ...] = ()) -> Suite:
-    """Return the benchmark, or its quick version, with the named settings or all."""
-    content = read_yaml(FILE)
+def load_suite(
+    quick: bool = False, settings: tuple[str, ...] = (), name: SuiteName = "settings"
+) -> Suite:
+    """Return a suite, or its quick version, with the named settings or all."""
+    file = FILE.with_stem(name)
+    content = read_yaml(file)
     changes = content.pop("quick")
     by_name = {setting["name"]: setting for setting in content["settings"]}
-    for name in settings:
-        choice("settings", name, by_name)
-    usual = changes.pop("settings") if quick else by_name
-    content["settings"] = [by_name[name] for name in settings or usual]
-    return checked(Suite, content | (changes if quick else {}), f"config {str(FILE)!r}")
+    for setting in settings:
+        choice("settings", setting, by_name)
+    usual = changes.pop("settings", by_name) if quick else by_name
+    content["settings"] = [by_name[setting] for setting in settings or usual]
+    return checked(Suite, content | (changes if quick else {}), f"config {str(file)!r}")
 
 
 def knowledge_of(setting: Setting, name: ClassName) -> Knowledge:

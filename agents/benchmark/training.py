@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import time
 import zipfile
 from dataclasses import dataclass, field
@@ -49,15 +50,16 @@ class TrainingJob(Job):
 
     @property
     def policy(self) -> Path:
-        """Return the file of the calibrated agent."""
-        return self.folder / "calibrated_model.zip"
+        """Return the file of the calibrated agent, or of the agent that cannot be calibrated."""
+        return self.folder / "calibrated_model.zip" if self.setting.calibrated else self.agent
 
 
 @dataclass(frozen=True)
 class TrainingResult:
     """Processor seconds of training and calibration, and the calibration.
 
-    ``relative_cost`` is the mean over the prices of the cost over the rule's, minus 1, in tuning.
+    ``relative_cost`` is the mean over the prices of the cost over the rule's, minus 1, in tuning,
+    NaN without a calibration.
     """
 
     seconds: float
@@ -75,12 +77,15 @@ def run_training(job: TrainingJob) -> TrainingResult:
         raise KeyboardInterrupt
     with replacing(job.agent) as partial:
         partial.write_bytes(small_model(job.folder / "best_model.zip"))
+    seconds = sum(value for name, value in summary["seconds"].items() if name != "validation")
+    if not job.setting.calibrated:
+        return TrainingResult(seconds, 0.0, math.nan, ())
     environment, began = experiment.environment, time.process_time()
     task = make_task(environment.id, **environment.options)
     with quietly():
         rows = calibrate(task, [job.agent], job.prices, job.episodes, job.policy, job.rule)
     return TrainingResult(
-        sum(value for name, value in summary["seconds"].items() if name != "validation"),
+        seconds,
         time.process_time() - began,
         float(np.mean([row.cost / row.rule_cost for row in rows])) - 1.0,
         tuple(row.point for row in rows),

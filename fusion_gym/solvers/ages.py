@@ -13,7 +13,6 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.channel import Channel
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.single import iterate_values
-from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.systems.remote.vector import VectorSources
 from fusion_gym.validation import ConfigurationError
 
@@ -38,25 +37,6 @@ class AgeSource:
     drop: Array
     transition: Array
     growth: float
-
-    @classmethod
-    def of_scalar(
-        cls, problem: SourceProblem, longest: int | None = None, sharing: float = 1.0
-    ) -> AgeSource:
-        """Return a scalar source with an exact sensor.
-
-        Args:
-            problem: the source; its token levels are ignored.
-            longest: largest age K; by default about four times the best period.
-            sharing: sources for each transmission in a step.
-        """
-        size = longest or _default_length(problem, sharing)
-        with np.errstate(over="ignore"):
-            powers = problem.coefficient ** (2.0 * np.arange(size))
-        errors = problem.error_weight * problem.deviation**2 * np.cumsum(powers)
-        costs = np.concatenate((np.zeros(1), errors))
-        growth = problem.coefficient**2
-        return cls(costs, problem.price, problem.drop, problem.transition, growth)
 
 
 def age_sources(task: Task, longest: int = _LONGEST) -> tuple[AgeSource, ...]:
@@ -185,13 +165,6 @@ def _excess(sources: tuple[AgeSource, ...], sets: list[int]) -> Array | None:
             more[:-1, :, -1] += loss[1] * above * step[1] if chosen == 2 else math.inf
             more[-1, :, -1] += above * step[1]
     return result
-
-
-def _default_length(problem: SourceProblem, sharing: float) -> int:
-    period = np.sqrt(2.0 * problem.price / problem.error_weight) / problem.deviation
-    drop = float(problem.drop.max())
-    losses = np.log(1e-6) / np.log(drop) if 0.0 < drop < 1.0 else 0.0
-    return int(np.ceil(4.0 * max(period, sharing) + losses * max(sharing, 1.0))) + 6
 
 
 def _moved(source: AgeSource, value: Array, axis: int, sent: bool) -> Array:

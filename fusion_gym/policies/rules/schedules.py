@@ -363,7 +363,7 @@ class MaximumAge(Rule):
     """
 
     at_most: int | None = parameter(1, check_at_most)
-    least: int = parameter(1, validation.integer, at_least=1)
+    least: float = parameter(1.0, validation.number, at_least=1.0)
     knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
