@@ -32,6 +32,12 @@ _LARGE = 16  # rows from which on BLAS and LAPACK are faster than element-wise o
 _ROUNDING = 2e-15  # relative rounding error of a difference of variances, per row
 _CHUNK = 32  # runs per transposition, which then stays in the cache
 _ALL = slice(None)
+TOLERANCE = 1e-6  # share of a threshold within which a change reaches it
+
+
+def reaches(change: FloatArray, threshold: FloatArray) -> Any:
+    """Return where a change is not zero and at least a threshold, up to ``TOLERANCE``."""
+    return (change > 0.0) & (change >= (1.0 - TOLERANCE) * threshold)
 
 
 def identity(size: int) -> FloatArray:

@@ -240,13 +240,15 @@ def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = Fals
     return (matrix + matrix.T) / 2
 
 
-def positive(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return an array broadcast to ``shape`` with entries > 0."""
+def positive(
+    field: str, value: ArrayLike, shape: tuple[int, ...], least: float = SMALLEST
+) -> Array:
+    """Return an array broadcast to ``shape`` with entries > 0, at least ``least``."""
     result = spread(field, value, shape)
     if np.any(result <= 0):
         raise refusal(field, value, "> 0 everywhere")
-    if np.any(result < SMALLEST):
-        raise refusal(field, value, f"> 0 everywhere, at least {SMALLEST:g}")
+    if np.any(result < least):
+        raise refusal(field, value, f"> 0 everywhere, at least {least:g}")
     return result
 
 

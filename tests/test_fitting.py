@@ -214,11 +214,68 @@ def test_a_share_beyond_the_log_is_refused(share: float) -> None:
         fit(recording(simulate(1000)), share)
 
 
-def test_a_channel_that_hardly_changes_is_refused() -> None:
+def test_a_channel_that_does_not_change_in_the_fitted_part_is_refused() -> None:
     path = simulate(1000)
-    path[:, 1] *= 1e-9
-    with pytest.raises(ConfigurationError, match=r"deviation of c1 = .* >= 1e-06"):
+    path[:500, 1] = 101.3
+    with pytest.raises(ConfigurationError, match=r"channels = 'c1' .* change in the fitted part"):
         fit(recording(path))
+
+
+@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("gaps", [0.0, 0.2])
+def test_a_plant_is_the_same_in_every_unit(exact: bool, gaps: float) -> None:
+    path = simulate(2400)
+    path[np.random.default_rng(1).random(path.shape) < gaps] = np.nan
+    expected = fit(recording(path), exact=exact)
+    for unit in (1e-9, 1e-6, 1e3, 1.8, np.array([1e-9, 1.0, 1e3])):
+        sizes = np.tile(np.broadcast_to(unit, 3), expected.order)
+        plant = fit(recording(path * unit), exact=exact)
+        transition = plant.transition / np.divide.outer(sizes, sizes)
+        assert transition == pytest.approx(expected.transition, rel=1e-6, abs=1e-9)
+        process = plant.process_covariance / np.outer(sizes, sizes)
+        assert process == pytest.approx(expected.process_covariance, rel=1e-6, abs=1e-9)
+        noise = plant.measurement_variance / sizes[:3] ** 2
+        assert noise == pytest.approx(expected.measurement_variance, rel=1e-6)
+    micro = fit(recording(path * 1e-6), exact=exact).options
+    fusion_gym.make_task("fusion_gym/LinearFusion-v2", **micro)
+    with pytest.raises(ConfigurationError, match=r"deviation of c0 = .* >= 1e-07"):
+        _ = fit(recording(path * 1e-9), exact=exact).options
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_channel_may_be_silent_for_long(exact: bool) -> None:
+    """Silent in the last 3,100 rows of the fitted part: the rows before have its coefficients."""
+    path = simulate(8000)
+    path[900:4000, 1] = np.nan
+    plant = fit(recording(path), exact=exact, order=1)
+    assert plant.transition == pytest.approx(A, abs=0.08)
+    path[150:4000, 1] = np.nan
+    with pytest.raises(ConfigurationError, match="readings of c1 in the fitted part = 150 "):
+        fit(recording(path), exact=exact)
+
+
+def test_exact_readings_in_coarse_steps_have_no_noise() -> None:
+    """Two thirds of neighbouring readings are equal, as of rooms in steps of 0.1."""
+    path = np.round(0.05 * simulate(8000)[:, :1] + 21.0, 1)
+    assert (np.diff(path, axis=0) == 0.0).mean() > 0.5
+    plant = fit(recording(path), exact=True)
+    assert plant.measurement_variance == pytest.approx(1e-10 * path[:4000].var(), rel=1e-9)
+    assert noisy_channels(plant) == []
+
+
+def test_an_alarm_that_begins_late_is_fitted() -> None:
+    path = np.c_[simulate(4000)[:, :2], np.arange(4000) > 1990]
+    assert np.isfinite(fit(recording(path), exact=True).transition).all()
+
+
+@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("weights", [(0.0, 1.0), (1.0, 1.0)])
+def test_channels_that_determine_each_other_are_refused(
+    weights: tuple[float, float], exact: bool
+) -> None:
+    path = simulate(2000)[:, :2]
+    with pytest.raises(ConfigurationError, match="do not determine each other"):
+        fit(recording(np.c_[path, path @ weights]), exact=exact)
 
 
 def test_the_mast_has_errors_near_the_models() -> None:

@@ -28,6 +28,7 @@ RULES = (
     "innovation_threshold:threshold=1.1",
     "innovation_threshold:threshold=1.1,whitened=true,at_most=1",
     "send_on_delta:threshold=0.9",
+    "report_on_change:reportable_change=20,percent=true",
     "information_gain:threshold=0.03,at_most=none",
     "information_gain:threshold=0.01",
 )

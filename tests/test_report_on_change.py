@@ -1,9 +1,11 @@
 """Reports of devices: change and intervals, against an independent loop."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.policies.base import LocalRule
+from fusion_gym.recordings import FittedPlant
 from fusion_gym.validation import ConfigurationError
 
 LINEAR = "fusion_gym/LinearFusion-v2"
@@ -33,7 +36,7 @@ class Device:
         due = self.most is not None and self.since >= self.most
         for new, old in zip(value, self.reported, strict=True):
             step = self.change / 100.0 * abs(old) if self.percent else self.change
-            due = due or abs(new - old) >= step
+            due = due or (new != old and abs(new - old) >= step * (1.0 - 1e-6))
         if not due or self.since < self.least:
             return False
         self.reported, self.since = value, 0
@@ -69,6 +72,41 @@ def test_reports_are_those_of_a_device(
         expected = [[devices[s][n].reports(value[s, :, n]) for n in range(3)] for s in range(2)]
         requests = rule(batch.signals())
         np.testing.assert_array_equal(requests, expected)
+        batch.step(requests)
+
+
+@pytest.mark.parametrize("level", [0, 203, 10_000_007])
+@pytest.mark.parametrize(
+    ("rule", "units"),
+    [
+        ("report_on_change:reportable_change=0.1", 1),
+        ("send_on_delta:threshold=0.3", 3),
+        ("report_on_change:reportable_change=0", 0),
+        ("report_on_change:reportable_change=50,percent=true", None),
+    ],
+)
+def test_readings_in_steps_are_reported_as_by_a_device_that_compares_integers(
+    rule: str, units: int | None, level: int, tmp_path: Path
+) -> None:
+    """A log in steps of 0.1, with long runs of equal readings; rates by a loop over integers."""
+    draw, steps = np.random.default_rng(0), 2000
+    change = draw.integers(-2, 3, steps) * (draw.random(steps) < 0.5)
+    rain = (draw.random(steps) < 0.2) * draw.integers(1, 9, steps)
+    values = rain if units is None else np.abs(np.cumsum(change)) + level
+    index = pd.date_range("2026-01-01", periods=steps, freq="15min", name="time")
+    pd.DataFrame({"a": [f"{value / 10:.1f}" for value in values]}, index).to_csv(tmp_path / "log")
+    one = np.eye(1)
+    plant = FittedPlant(("a",), 0.9 * one, one, np.array([1e-12]), 1)
+    free = {"log": str(tmp_path / "log"), "tokens": "unlimited", "horizon": 900}
+    task = fusion_gym.make_task("fusion_gym/RecordedFusion-v1", **free | plant.options)
+    batch, policy = EpisodeBatch.seeded(task, 1, 0), fusion_gym.make_policy(rule, task)
+    held, *rest = values[1000:1901]
+    for value in rest:
+        least = held / 2 if units is None else units
+        due = value != held and abs(value - held) >= least
+        requests = policy(batch.signals())
+        assert requests.item() == due
+        held = value if due else held
         batch.step(requests)
 
 

@@ -14,7 +14,7 @@ from command_runs import Ended, call
 from hostile_folder import contents
 
 from agents import cache
-from agents.papers import page, paper
+from agents.papers import checks, page, paper
 from agents.papers.numbers import Number
 from fusion_gym.validation import ConfigurationError
 
@@ -61,7 +61,7 @@ def a_paper(name: str, calls: Calls) -> paper.Paper:
     return paper.Paper(
         name, [a_piece(piece) for piece in PIECES],
         {"figure_5": paper.PaperFigure("first", draw, (2.0, 1.5))}, "fusion_gym/TobitOscillator-v1",
-        {"m": paper.Parameter((0.5,), paper.numbers_within(at_least=0.0))}, ("horizon",),
+        {"m": paper.Parameter((0.5,), checks.numbers_within(at_least=0.0))}, ("horizon",),
     )  # fmt: skip
 
 

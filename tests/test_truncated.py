@@ -44,7 +44,8 @@ def test_a_silent_update_is_the_truncation_by_quadrature(trigger: str) -> None:
         variance = row @ across + sensors.variance[0, 0, 0]
         mean = row @ state.prior_mean
         middle = mean if trigger == "innovation_threshold" else state.held[0, 0]
-        first, second = moments(middle - 0.7, middle + 0.7, mean, variance**0.5)
+        width = 0.7 if trigger == "innovation_threshold" else 0.7 * (1.0 - 1e-6)
+        first, second = moments(middle - width, middle + width, mean, variance**0.5)
         gain = across / variance
         sent = np.zeros((2, 50), dtype=np.bool_)
         silent = batch.task.estimator.update(state, Reception(sent))
@@ -104,14 +105,15 @@ def test_silence_of_a_lossy_source_is_a_mixture_by_quadrature() -> None:
     )
     batch = EpisodeBatch.seeded(task, 40, 0)
     nodes, weights = np.polynomial.legendre.leggauss(400)
+    width = 1.4 * (1.0 - 1e-6)
     for step in range(12):
         state = batch.state.estimate
         mean, deviation = state.prior[0], state.prior_variance[0] ** 0.5
         middle, total = state.held[0], np.zeros((3, 40))
-        edges = [mean - 12 * deviation, middle - 1.4, middle + 1.4, mean + 12 * deviation]
+        edges = [mean - 12 * deviation, middle - width, middle + width, mean + 12 * deviation]
         for low, high in itertools.pairwise(np.sort(edges, axis=0)):
             x = 0.5 * (low + high) + 0.5 * (high - low) * nodes[:, None]
-            density = norm.pdf(x, mean, deviation) * np.where(abs(x - middle) < 1.4, 1.0, 0.3)
+            density = norm.pdf(x, mean, deviation) * np.where(abs(x - middle) < width, 1.0, 0.3)
             mass = 0.5 * (high - low) * weights[:, None] * density
             total += [(mass * x**k).sum(0) for k in range(3)]
         first = total[1] / total[0]

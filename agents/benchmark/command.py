@@ -19,13 +19,7 @@ from typing import Annotated
 
 import tyro
 
-from agents.benchmark.evidence import (
-    check_policy,
-    class_rows,
-    evaluate_policy,
-    gather,
-    point_rows,
-)
+from agents.benchmark.evidence import check_policy, class_rows, evaluate_policy, gather, point_rows
 from agents.benchmark.jobs import Runner
 from agents.benchmark.report import print_classes, write_results
 from agents.benchmark.settings import ClassName, SuiteName, load_suite

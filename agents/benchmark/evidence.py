@@ -11,32 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agents.benchmark import verdict
 from agents.benchmark.jobs import Runner
 from agents.benchmark.rules import SearchJob, SweepJob, SweepResult, rules_of, run_search, run_sweep
-from agents.benchmark.settings import (
-    Case,
-    ClassName,
-    Setting,
-    Suite,
-    knowledge_of,
-)
+from agents.benchmark.settings import Case, ClassName, Setting, Suite, knowledge_of
 from agents.benchmark.training import TrainingJob, TrainingResult, run_training
-from agents.benchmark.verdict import (
-    BoundJob,
-    Difference,
-    TestJob,
-    TestResult,
-    cost_difference,
-    discoveries,
-    mean_difference,
-    run_bound,
-    run_test,
-)
+from agents.benchmark.verdict import mean_difference
 from fusion_gym.core.knowledge import covers
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-TestResults = tuple[TestResult, ...]
+TestResults = tuple[verdict.TestResult, ...]
 REFERENCE = "rule"
 CALIBRATED = {"agent": "learned", "other": "other_learned"}  # by the kind of the agent alone
 
@@ -143,7 +128,7 @@ class Evidence:
     def test(
         self, policies: Sequence[str], episodes: int, case: Case | None = None,
         prices: Sequence[float] | None = None,
-    ) -> TestJob:  # fmt: skip
+    ) -> verdict.TestJob:  # fmt: skip
         """Return the test of one policy per price; the key of an agent is its file's content."""
         own_prices = tuple(self.prices if prices is None else prices)
         texts = tuple(
@@ -155,7 +140,7 @@ class Evidence:
         if agent:
             file = Path(texts[0].removeprefix("model:").rpartition(",price=")[0])
             content = hashlib.sha256(file.read_bytes()).hexdigest()
-        return TestJob(
+        return verdict.TestJob(
             self.setting, self.name, texts, own_prices, self.prices, episodes, content, agent, case
         )
 
@@ -181,8 +166,8 @@ def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     classes = find_prices(suite, runner)
     find_rules(suite, runner, classes)
     train_agents(suite, runner, classes)
-    jobs = [BoundJob(item.setting, item.name, item.prices) for item in classes]
-    for item, bounds in zip(classes, runner.run(run_bound, jobs, "bounds"), strict=True):
+    jobs = [verdict.BoundJob(item.setting, item.name, item.prices) for item in classes]
+    for item, bounds in zip(classes, runner.run(verdict.run_bound, jobs, "bounds"), strict=True):
         item.bounds = bounds
     places = [(item, kind, texts) for item in classes for kind, texts in policies_of(item)]
     test_all(suite, runner, places)
@@ -241,7 +226,9 @@ def test_all(
         item.test(texts, suite.episodes, item.setting.trigger.case if kind == "trigger" else None)
         for item, kind, texts in places
     ]
-    for (item, kind, _), outcomes in zip(places, runner.run(run_test, jobs, "tests"), strict=True):
+    for (item, kind, _), outcomes in zip(
+        places, runner.run(verdict.run_test, jobs, "tests"), strict=True
+    ):
         item.tests.setdefault(kind, []).append(outcomes)
 
 
@@ -265,7 +252,7 @@ def policies_of(item: Evidence) -> Iterator[tuple[str, list[str]]]:
 def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
     """Test the rule, and the learned policy with the least cost in tuning, in perturbed cases."""
     places: list[tuple[Evidence, str]] = []
-    jobs: list[TestJob] = []
+    jobs: list[verdict.TestJob] = []
     for item in classes:
         texts = item.priced_rule, f"model:{item.best_policy},price={{price}}"
         prices = item.prices[1:4]  # the middle ones
@@ -273,7 +260,7 @@ def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> Non
             places.append((item, "as assumed" if case is None else case.name))
             for text in texts:
                 jobs.append(item.test([text] * 3, suite.case_episodes, case, prices))
-    results = runner.run(run_test, jobs, "perturbed cases")
+    results = runner.run(verdict.run_test, jobs, "perturbed cases")
     for place, (item, name) in enumerate(places):
         item.cases[name] = results[2 * place], results[2 * place + 1]
 
@@ -326,7 +313,7 @@ def policy_rows(suite: Suite, classes: Sequence[Evidence]) -> list[TestRow]:
 def point_rows(suite: Suite, classes: Sequence[Evidence]) -> list[PointRow]:
     """Return the difference to the searched rule at every price."""
     places: list[tuple[Evidence, str, float, float]] = []
-    results: list[Difference] = []
+    results: list[verdict.Difference] = []
     for item in classes:
         reference = item.tests[REFERENCE][0]
         for kind, every in item.tests.items():
@@ -335,8 +322,8 @@ def point_rows(suite: Suite, classes: Sequence[Evidence]) -> list[PointRow]:
             for place, price in enumerate(item.prices):
                 costs = [outcomes[place].cost for outcomes in every]
                 places.append((item, kind, suite.shares[place], price))
-                results.append(cost_difference(costs, reference[place].cost))
-    counts = discoveries([item.p for item in results])
+                results.append(verdict.cost_difference(costs, reference[place].cost))
+    counts = verdict.discoveries([item.p for item in results])
     return [
         PointRow(item.setting.name, item.name, kind, share, price, d.mean, d.low, d.high, counted)
         for (item, kind, share, price), d, counted in zip(places, results, counts, strict=True)

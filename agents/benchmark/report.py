@@ -15,22 +15,8 @@ from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 
-from agents.benchmark.evidence import (
-    CALIBRATED,
-    CaseRow,
-    ClassRow,
-    Evidence,
-    PointRow,
-    SavingRow,
-    TestRow,
-    TrainingRow,
-    case_rows,
-    class_rows,
-    point_rows,
-    policy_rows,
-    saving_rows,
-    training_rows,
-)
+from agents.benchmark import evidence
+from agents.benchmark.evidence import CALIBRATED
 from agents.benchmark.settings import CLASSES, Setting, Suite
 from fusion_gym.arrays import Array
 from fusion_gym.docstrings import table
@@ -39,6 +25,7 @@ from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.palette import READABLE
 from fusion_gym.version import __version__
 
+Groups = dict[tuple[str, str, str], list[evidence.TrainingRow]]
 HEADLINE = "biased_oscillator", "local"  # the class of README's figure
 GAIN = 0.01  # a difference that the sentences name, and between a mean and a median
 README = Path("README.md")
@@ -71,24 +58,24 @@ STYLES = {
 class Results(NamedTuple):
     """All rows of the benchmark."""
 
-    policies: list[TestRow]
-    points: list[PointRow]
-    classes: list[ClassRow]
-    savings: list[SavingRow]
-    trainings: list[TrainingRow]
-    cases: list[CaseRow]
+    policies: list[evidence.TestRow]
+    points: list[evidence.PointRow]
+    classes: list[evidence.ClassRow]
+    savings: list[evidence.SavingRow]
+    trainings: list[evidence.TrainingRow]
+    cases: list[evidence.CaseRow]
 
 
-def write_results(suite: Suite, classes: Sequence[Evidence], folder: Path) -> None:
+def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Path) -> None:
     """Write all tables, a figure per setting, the page, and README's table."""
     folder.mkdir(parents=True, exist_ok=True)
     results = Results(
-        policy_rows(suite, classes),
-        point_rows(suite, classes),
-        class_rows(classes),
-        saving_rows(classes),
-        training_rows(classes),
-        case_rows([item for item in classes if item.name == "scheduler"]),
+        evidence.policy_rows(suite, classes),
+        evidence.point_rows(suite, classes),
+        evidence.class_rows(classes),
+        evidence.saving_rows(classes),
+        evidence.training_rows(classes),
+        evidence.case_rows([item for item in classes if item.name == "scheduler"]),
     )
     for name, rows in results._asdict().items():
         with replacing(folder / f"{name}.csv") as partial:
@@ -159,13 +146,15 @@ def signed_percent(value: float, digits: int = 1) -> str:
     return f"{round(100.0 * value, digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
-def interval(row: PointRow | ClassRow | SavingRow | CaseRow, value: float) -> str:
+def interval(
+    row: evidence.PointRow | evidence.ClassRow | evidence.SavingRow | evidence.CaseRow, value: float
+) -> str:
     """Return a value in per cent with half the width of its row's interval."""
     half = 50.0 * (row.high - row.low)
     return signed_percent(value) + (f" ± {half:.1f}" if half > 0.0 else "")
 
 
-def headline_text(settings: Sequence[Setting], rows: Sequence[SavingRow]) -> str:
+def headline_text(settings: Sequence[Setting], rows: Sequence[evidence.SavingRow]) -> str:
     """Return the table of what thresholds, search and learning save, a row for each setting."""
     kinds = "threshold", "rule", "learned"
     by_kind = {(row.setting, row.kind): row for row in rows}
@@ -216,7 +205,7 @@ def class_table(titles: dict[str, str], results: Results) -> str:
     return table(heads, lines)
 
 
-def mean_text(row: ClassRow | None) -> str:
+def mean_text(row: evidence.ClassRow | None) -> str:
     """Return a mean with its interval, and with the median where an outlier moves the mean."""
     if row is None:
         return "–"
@@ -242,9 +231,9 @@ def comparison_table(titles: dict[str, str], results: Results) -> str:
     return table(("setting", "class", "algorithm", "seconds", "agents alone", "calibrated"), lines)
 
 
-def grouped(rows: Sequence[TrainingRow]) -> dict[tuple[str, str, str], list[TrainingRow]]:
+def grouped(rows: Sequence[evidence.TrainingRow]) -> Groups:
     """Return the trainings of each setting, class and kind."""
-    result: dict[tuple[str, str, str], list[TrainingRow]] = {}
+    result: Groups = {}
     for row in rows:
         result.setdefault((row.setting, row.name, row.kind), []).append(row)
     return result
@@ -289,7 +278,7 @@ def sentences(results: Results) -> list[str]:
     ]
 
 
-def mean_line(rows: Sequence[TestRow], kind: str) -> Array:
+def mean_line(rows: Sequence[evidence.TestRow], kind: str) -> Array:
     """Return price, cost, error and tokens (4, prices) of a kind, as means over seeds."""
     own = [(row.price, row.cost, row.error, row.tokens) for row in rows if row.kind == kind]
     prices = sorted({item[0] for item in own})
@@ -297,7 +286,7 @@ def mean_line(rows: Sequence[TestRow], kind: str) -> Array:
     return np.array(line).reshape(-1, 4).T
 
 
-def draw_setting(rows: Sequence[TestRow], title: str, folder: Path) -> None:
+def draw_setting(rows: Sequence[evidence.TestRow], title: str, folder: Path) -> None:
     """Draw error against tokens per step, one panel per class."""
     plt.rcParams.update(READABLE)
     names = list(dict.fromkeys(row.name for row in rows))
@@ -313,7 +302,7 @@ def draw_setting(rows: Sequence[TestRow], title: str, folder: Path) -> None:
     save_figure(figure, folder / f"{rows[0].setting}.png")
 
 
-def draw_class(panel: Axes, rows: Sequence[TestRow]) -> dict[str, Line2D]:
+def draw_class(panel: Axes, rows: Sequence[evidence.TestRow]) -> dict[str, Line2D]:
     """Draw error against tokens in one class, and return the lines by label.
 
     Points without tokens stand at a tick "0" of their own, left of a dotted line.
@@ -386,7 +375,7 @@ def draw_headline(results: Results, titles: dict[str, str], path: Path) -> None:
     save_figure(figure, path)
 
 
-def print_classes(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> None:
+def print_classes(rows: Sequence[evidence.ClassRow], points: Sequence[evidence.PointRow]) -> None:
     """Print the mean differences to the searched rule, and the difference at each price."""
     places = ["setting", "name", "kind"]
     each = pd.DataFrame(points).pivot(index=places, columns="share", values="difference")

@@ -12,13 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from agents.benchmark.jobs import Job
-from agents.benchmark.settings import (
-    Case,
-    ClassName,
-    Setting,
-    ThresholdRule,
-    knowledge_of,
-)
+from agents.benchmark.settings import Case, ClassName, Setting, ThresholdRule, knowledge_of
 from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import covers

@@ -10,14 +10,9 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.rule_search import ClassName
+from fusion_gym.training import config
 from fusion_gym.training.algorithms import AnyAlgorithm
 from fusion_gym.training.checked import Positive, Rate, Share, Strict, checked, read_yaml
-from fusion_gym.training.config import (
-    EnvironmentConfig,
-    Experiment,
-    TrainingConfig,
-    ValidationConfig,
-)
 from fusion_gym.validation import choice
 
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)
@@ -155,24 +150,24 @@ class Suite(Strict):
         seed: int,
         algorithm: AnyAlgorithm,
         steps: float,
-    ) -> Experiment:
+    ) -> config.Experiment:
         """Return the training of one agent at random prices, with a factor of its time steps."""
         timesteps = max(round(setting.timesteps * self.steps * steps), 1)
-        return Experiment(
-            environment=EnvironmentConfig(
+        return config.Experiment(
+            environment=config.EnvironmentConfig(
                 id=setting.environment,
                 options=setting.agent_environment(name, (min(prices), max(prices))),
                 local=name == "local",
             ),
             algorithm=algorithm,
-            training=TrainingConfig(
+            training=config.TrainingConfig(
                 timesteps=timesteps,
                 num_envs=setting.num_envs,
                 seed=seed,
                 price_exponent=0.8,
                 error=setting.error,
             ),
-            validation=ValidationConfig(every=max(timesteps // 3, 1), episodes=256),
+            validation=config.ValidationConfig(every=max(timesteps // 3, 1), episodes=256),
             calibration=None,
             output="agent",
         )

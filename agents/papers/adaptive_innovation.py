@@ -12,28 +12,12 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 import fusion_gym
-from agents.papers.adaptive_innovation_runs import (
-    ELLIPSES,
-    SENSORS,
-    STEPS,
-    ErrorRecord,
-    Lane,
-    RequestFunction,
-    steps,
-    top,
-)
+from agents.papers import adaptive_innovation_runs as runs
+from agents.papers import checks
+from agents.papers.adaptive_innovation_runs import SENSORS, STEPS, Lane
 from agents.papers.drawing import legend, set_ticks, stack
 from agents.papers.numbers import Number, grid
-from agents.papers.paper import (
-    Data,
-    Paper,
-    PaperFigure,
-    Parameter,
-    Piece,
-    Settings,
-    numbers_within,
-    policy_of,
-)
+from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.output import palette
@@ -124,7 +108,7 @@ def simulate_rates(
     lanes = _readings()
     requested = np.empty((STEPS, len(SENSORS), len(readings) * episodes), dtype=np.bool_)
     innovation = np.empty((STEPS, len(SENSORS), episodes))
-    run = steps([lanes[name] for name in readings], episodes, seed, settings, fusion="sici")
+    run = runs.steps([lanes[name] for name in readings], episodes, seed, settings, fusion="sici")
     for step in run:
         requested[step.number] = step.outcome.requested
         innovation[step.number] = step.innovation[:, :episodes]
@@ -159,16 +143,9 @@ def _summarise_rates(data: Data) -> Data:
     far = np.abs(100.0 * (rates.mean(-1) - np.array(PRINTED))).max(1)
     size = np.linspace(0.0, 5.0, 51)
     falls = [bool((np.diff(level(size, size)) < 0.0).all()) for level in (_printed, _ours)]
+    others = {name: 100.0 * by[name] for name in readings if name not in (OURS, FIXED, TIMED)}
     return {
-        "tables": {
-            "rates": numbers,
-            "readings": [
-                Number.from_sample(f"{reading}: {name}", 100.0 * sample, unit="%")
-                for reading, samples in by.items()
-                if reading not in (OURS, FIXED, TIMED)
-                for name, sample in zip(SENSORS, samples, strict=True)
-            ],
-        },
+        "tables": {"rates": numbers, "readings": grid(SENSORS, others, "%")},
         "steps": STEPS, "counts": [round(STEPS * printed) for printed in PRINTED],
         "away": [(100.0 * p - n.mean) / n.spread for p, n in zip(PRINTED, numbers, strict=True)],
         "usual": float(norm.ppf(0.5 + 0.5 * 0.95 ** (1.0 / len(numbers)))),
@@ -188,7 +165,7 @@ def _summarise_rates(data: Data) -> Data:
 # --- errors, actual and conservative variances ----------------------------------------------------
 
 
-def _of_other_episodes(episodes: int) -> RequestFunction:
+def _of_other_episodes(episodes: int) -> runs.RequestFunction:
     """Return the trigger's requests in the next episode of the first lane.
 
     They have the same rates and patterns, and are independent of the episode's own noise.
@@ -225,9 +202,9 @@ def simulate_fusion(
     selected = {name: lane for group in lanes for name, lane in groups[group].items()}
     data: Data = {"lanes": list(selected), "scales": list(settings["scales"])}
     for fusion in fusions:
-        record = ErrorRecord(len(selected), episodes, with_nodes=fusion == FUSIONS[0])
+        record = runs.ErrorRecord(len(selected), episodes, with_nodes=fusion == FUSIONS[0])
         options = {"fusion": fusion, "track_actual": True}
-        for step in steps(selected.values(), episodes, seed, settings, **options):
+        for step in runs.steps(selected.values(), episodes, seed, settings, **options):
             record.add(step)
         data |= {f"{fusion}_{name}": value for name, value in record.arrays().items()}
     return data
@@ -282,7 +259,7 @@ def _summarise_fusion(data: Data) -> Data:
             "traces": traces(names), "scales": traces(low_names), "inside": grid(STATES, rows),
         },
         "quantities": list(quantities.values()), "states": STATES, "rules": list(NAMES.values()),
-        "runs": data["sci_mse"].shape[-1], "ellipses": ELLIPSES,
+        "runs": data["sci_mse"].shape[-1], "ellipses": runs.ELLIPSES,
         "late": lanes.both("mse_steps", AT_BOUND)[:, _LATE],
         "at": {name: lanes.both(name, AT_BOUND) for name in at_bound},
         "within": np.mean([_within(lanes, lane) for lane in scaled], axis=0), "inside": inside,
@@ -294,7 +271,7 @@ def _summarise_fusion(data: Data) -> Data:
         "bounded": lanes.means("bounded", every),
         "settings": [name.removeprefix("scale ") for name in every],
         "worst": np.max([lanes.both("worst", lane).max(-1) for lane in every], axis=0),
-        "real": [top(lanes("sici", "whitened", lane)) for lane in (ALWAYS, AT_BOUND)],
+        "real": [runs.top(lanes("sici", "whitened", lane)) for lane in (ALWAYS, AT_BOUND)],
         "node": lanes("sci", "node_mse", AT_BOUND),
         "node_share": min(float(lanes("sci", "node_bounded", lane).min()) for lane in every),
         "gap": float(lanes("sci", "node_gap", AT_BOUND).max()),
@@ -476,8 +453,8 @@ PAPER = Paper(
     },
     "fusion_gym/CorrelatedTracking-v1",
     {
-        "scales": Parameter((0.8, 0.6, 0.4), numbers_within(above=0.0, at_most=1.0)),
-        "policy": Parameter(TRIGGER, policy_of(TRIGGER)),
+        "scales": Parameter((0.8, 0.6, 0.4), checks.numbers_within(above=0.0, at_most=1.0)),
+        "policy": Parameter(TRIGGER, checks.policy_of(TRIGGER)),
     },
     ("process_variance", "trigger_threshold", "trigger_offset", "trigger_sensitivity"),
 )

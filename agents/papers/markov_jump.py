@@ -13,33 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
+from agents.papers import checks
 from agents.papers.drawing import legend, stack
 from agents.papers.markov_jump_covariances import covariances
 from agents.papers.numbers import Number, below, grid
-from agents.papers.paper import (
-    Data,
-    Paper,
-    PaperFigure,
-    Parameter,
-    Piece,
-    Settings,
-    numbers_within,
-    policy_list,
-)
+from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
 from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.output.palette import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SENSORS,
-    SKY,
-    TRUTH,
-    VERMILLION,
-)
+from fusion_gym.output import palette
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 
 STATES = ("position", "velocity")
@@ -167,11 +149,7 @@ def _summarise_schedule(data: Data) -> Data:
     return {
         "columns": columns,
         "tables": {
-            "schedule": [
-                Number(f"{label}: {what}", value, value, value)
-                for label, row in zip(data["labels"], values.tolist(), strict=True)
-                for what, value in zip(columns, row, strict=True)
-            ],
+            "schedule": grid(columns, dict(zip(data["labels"], values[..., None], strict=True))),
             "fading": [
                 Number(f"{what} of node {node + 1}", ours, ours, ours, value, half / 1.96)
                 for what, (printed, half) in _PRINTED.items()
@@ -341,13 +319,13 @@ def _summarise_others(data: Data) -> Data:
 
 # A colour and a line for each threshold or policy, the same in all figures.
 _LINES: tuple[tuple[str, Any], ...] = (
-    (GREEN, "-"),
-    (BLUE, (0, (5, 1))),
-    (ORANGE, "-"),
-    (VERMILLION, (0, (1.5, 0.8))),
-    (PURPLE, "-"),
-    (SKY, (0, (5, 1))),
-    (BLACK, (0, (1.5, 0.8))),
+    (palette.GREEN, "-"),
+    (palette.BLUE, (0, (5, 1))),
+    (palette.ORANGE, "-"),
+    (palette.VERMILLION, (0, (1.5, 0.8))),
+    (palette.PURPLE, "-"),
+    (palette.SKY, (0, (5, 1))),
+    (palette.BLACK, (0, (1.5, 0.8))),
 )
 _TIME = "time k (steps of 0.5 s)"
 _LANE = 1.7
@@ -362,7 +340,7 @@ def _draw_instants(figure: Any, data: Data) -> None:
     for place, (axis, (label, sent)) in enumerate(zip(axes, lanes, strict=True)):
         time, count = np.arange(1, len(sent) + 1), sent.shape[-1]
         for sensor in range(count):
-            base, colour = _LANE * (count - 1 - sensor), SENSORS[sensor]
+            base, colour = _LANE * (count - 1 - sensor), palette.SENSORS[sensor]
             there = sent[:, sensor]
             axis.plot(time[there], base + there[there], "o", ms=4, color=colour)
             axis.plot(
@@ -384,7 +362,7 @@ def _draw_tracking(figure: Any, data: Data) -> None:
     truth = data["truth"]
     time = np.arange(1, len(truth) + 1)
     for state, axis in enumerate(axes):
-        axis.plot(time, truth[:, state], color=TRUTH, lw=1.8, label="state")
+        axis.plot(time, truth[:, state], color=palette.TRUTH, lw=1.8, label="state")
         _curves(axis, data, data["means"][..., state])
         _title(axis, state, STATES[state])
     _legend(figure, axes)
@@ -439,8 +417,8 @@ PAPER = Paper(
     },
     "fusion_gym/MarkovJumpTracking-v1",
     {
-        "m": Parameter((0.0, 0.9, 1.3, 1.5), numbers_within(at_least=0.0)),
-        "policies": Parameter((), policy_list),
+        "m": Parameter((0.0, 0.9, 1.3, 1.5), checks.numbers_within(at_least=0.0)),
+        "policies": Parameter((), checks.policy_list),
     },
     ("horizon", "fusion"),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -59,12 +59,13 @@ class Number(NamedTuple):
         return "–" if self.printed is None else f"{self.printed:.4g} {self.unit}".strip()
 
 
-def grid(columns: Sequence[str], rows: Mapping[str, Iterable[Any]]) -> list[Number]:
+def grid(columns: Iterable[str], rows: Mapping[str, Iterable[Any]], unit: str = "") -> list[Number]:
     """Return a number named "row: column" for each sample of each row."""
+    names = tuple(columns)
     return [
-        Number.from_sample(f"{row}: {column}", sample)
+        Number.from_sample(f"{row}: {column}", sample, unit=unit)
         for row, samples in rows.items()
-        for column, sample in zip(columns, samples, strict=True)
+        for column, sample in zip(names, samples, strict=True)
     ]
 
 

@@ -5,13 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
-
 import fusion_gym
 from agents.cache import Cache
 from fusion_gym.entries import Plain
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError, choice, keys, number, refusal
+from fusion_gym.validation import ConfigurationError, choice, keys
 
 NAMES = (
     "tobit_token_bucket",
@@ -145,37 +143,3 @@ def load_papers(names: Sequence[str]) -> list[Paper]:
     for name in names:
         choice("paper", name, (*NAMES, "all"))
     return [load_paper(name) for name in (NAMES if "all" in names else dict.fromkeys(names))]
-
-
-def numbers_within(**limits: float) -> Callable[[str, Any], tuple[float, ...]]:
-    """Return a check for one number, or up to nine different ones, within limits."""
-
-    def check(name: str, value: Any) -> tuple[float, ...]:
-        entries = value if isinstance(value, list | tuple) else (value,)
-        if not 1 <= len(entries) <= 9:
-            raise refusal(name, value, "a number, or up to nine separated by commas")
-        result = tuple(number(name, entry, **limits) for entry in entries)
-        if len(set(result)) < len(result):
-            raise refusal(name, value, "different numbers")
-        return result
-
-    return check
-
-
-def policy_of(rule: str = "NAME") -> Callable[[str, Any], str]:
-    """Return a check for a policy with parameters, optionally of one rule."""
-
-    def check(name: str, value: Any) -> str:
-        if not isinstance(value, str) or rule not in ("NAME", value.partition(":")[0]):
-            raise refusal(name, value, f"{rule!r}, or {rule + ':key=value,…'!r}")
-        return value
-
-    return check
-
-
-def policy_list(name: str, value: Any) -> tuple[str, ...]:
-    """Check one policy, or a list of them."""
-    entries = (value,) if isinstance(value, str) else tuple(np.atleast_1d(value).tolist())
-    if not all(isinstance(entry, str) for entry in entries):
-        raise refusal(name, value, "a policy, or a list of them")
-    return entries

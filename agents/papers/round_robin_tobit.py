@@ -12,20 +12,12 @@ from typing import Any
 import numpy as np
 
 import fusion_gym
+from agents.papers import checks
 from agents.papers import round_robin_tobit_runs as runs
 from agents.papers import round_robin_tobit_theorems as theorems
 from agents.papers.drawing import legend, stack
 from agents.papers.numbers import Number
-from agents.papers.paper import (
-    Data,
-    Paper,
-    PaperFigure,
-    Parameter,
-    Piece,
-    Settings,
-    numbers_within,
-    policy_of,
-)
+from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -113,7 +105,7 @@ def _summarise_curves(
 ) -> Data:
     filters = {"aware": "FTKF-DB", "unaware": "FTKF (bias ignored)"}
     numbers = [
-        runs.armse_number(f"ARMSE of {state}, {label}", data[f"{key}_armse"], i, None, units[i])
+        runs.armse_number(f"ARMSE of {state}, {label}", data[f"{key}_armse"], i, unit=units[i])
         for key, label in filters.items()
         for i, state in enumerate(states)
         if key == "aware" or i < 2
@@ -170,7 +162,7 @@ def _summarise_nodes(data: Data) -> Data:
         "columns": columns,
         "tables": {
             "nodes": [
-                runs.armse_number(f"{label}: {column}", data[f"{key}_armse"], state, None)
+                runs.armse_number(f"{label}: {column}", data[f"{key}_armse"], state)
                 for key, label in names.items()
                 for state, column in enumerate(columns)
             ]
@@ -265,9 +257,7 @@ def _summarise_tables(data: Data) -> Data:
     )
     references = []
     for label, row in others.items():
-        references += [
-            runs.armse_number(f"{label}: {heads[i]}", row["adf"], i, None) for i in range(3)
-        ]
+        references += [runs.armse_number(f"{label}: {heads[i]}", row["adf"], i) for i in range(3)]
         for name, head in zip(("adf", "paper"), heads[3:], strict=True):
             references.append(Number(f"{label}: {head}", *row[name]["median"]))
     return {
@@ -513,9 +503,9 @@ PAPER = Paper(
     },
     runs.OSCILLATOR,
     {
-        "interval": Parameter(tuple(TABLE_II), numbers_within(above=0.0)),
-        "variance": Parameter(tuple(TABLE_III), numbers_within(above=0.0)),
-        "policy": Parameter("periodic:period=2", policy_of()),
+        "interval": Parameter(tuple(TABLE_II), checks.numbers_within(above=0.0)),
+        "variance": Parameter(tuple(TABLE_III), checks.numbers_within(above=0.0)),
+        "policy": Parameter("periodic:period=2", checks.policy_of()),
     },
     ("horizon", "process_covariance", "bias_noise_covariance"),
 )  # fmt: skip

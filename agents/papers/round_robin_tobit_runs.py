@@ -12,6 +12,7 @@ from agents.papers.walk import walk, walk_in_parts
 from fusion_gym import gaussian
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.entries import Plain
 from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.centre import FederatedCentre
 from fusion_gym.systems.tobit.filters import Expectation
@@ -63,12 +64,10 @@ def held_values(task: Task, policy: str, seed: int) -> Array:
     return np.array(rows)
 
 
-def resampled(episodes: int, seed: int = 0) -> Array:
+def resampled(episodes: int) -> Array:
     """Return weights (resamples, episodes) with sum 1 of bootstrap samples of the episodes."""
-    drawn = np.random.default_rng(seed).multinomial(
-        episodes, np.full(episodes, 1.0 / episodes), size=_RESAMPLES
-    )
-    return np.asarray(drawn / episodes)
+    shares = np.full(episodes, 1.0 / episodes)
+    return np.random.default_rng(0).multinomial(episodes, shares, size=_RESAMPLES) / episodes
 
 
 def armse(squared: Array) -> dict[str, list[float]]:
@@ -96,9 +95,9 @@ def _with_ends(curve: Array, drawn: Array) -> dict[str, list[float]]:
     return {"mean": curve.mean(0).tolist(), "low": low.tolist(), "high": high.tolist()}
 
 
-def medians(squared: Array, state: int = 0) -> tuple[float, Array]:
-    """Return median over runs of a run's RMSE of a state, and (resamples,) of bootstrap samples."""
-    roots = np.sqrt(squared[..., state].mean(1))
+def medians(squared: Array) -> tuple[float, Array]:
+    """Return median over runs of a run's RMSE of x1, and (resamples,) of bootstrap samples."""
+    roots = np.sqrt(squared[..., 0].mean(1))
     order = np.argsort(roots)
     reached = np.cumsum(resampled(len(roots))[:, order], axis=1) >= 0.5
     return float(np.median(roots)), roots[order][np.argmax(reached, axis=1)]
@@ -112,7 +111,7 @@ def _drawn(squared: Array) -> Array:
 
 
 def armse_number(
-    what: str, lists: dict[str, list[float]], state: int, printed: float | None, unit: str = ""
+    what: str, lists: Plain, state: int, printed: float | None = None, unit: str = ""
 ) -> Number:
     """Return one entry of :func:`armse` with the printed one."""
     mean, low, high, spread = (lists[key][state] for key in ("mean", "low", "high", "spread"))

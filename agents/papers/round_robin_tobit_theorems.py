@@ -9,15 +9,9 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from agents.papers import round_robin_tobit_runs as measures
-from agents.papers.numbers import Number
+from agents.papers.numbers import Number, grid
 from agents.papers.paper import Data, Settings
-from agents.papers.round_robin_tobit_runs import (
-    FREE,
-    OSCILLATOR,
-    TRACKING,
-    PrintedTobitFilter,
-    censored,
-)
+from agents.papers.round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, censored
 from agents.papers.walk import SomeSensors, walk_in_parts
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
@@ -81,7 +75,7 @@ def _lemma(episodes: int, seed: int) -> Plain:
     fourth = ((drawn - drawn.mean(1, keepdims=True)) ** 4).mean(1)
     means = np.broadcast_to(truth, (sensors.count, *truth.shape))
     right = expect_censored(sensors, means)
-    printed = PrintedTobitFilter(sensors, "theta").expect(means)
+    printed = measures.PrintedTobitFilter(sensors, "theta").expect(means)
     return {
         "mean": drawn.mean(1), "mean_error": np.sqrt(spread / draws), "variance": spread,
         "variance_error": np.sqrt(np.maximum(fourth - spread**2, 0.0) / draws),
@@ -358,16 +352,11 @@ def summarise_bounds(data: Data) -> Data:
     for name in (key.partition(":")[2] for key in data if key.startswith("oscillator:")):
         theorem, end, reading, *sensor = name.split("/")
         which = f", sensor {int(sensor[0]) + 1}" if sensor else ""
-        rows[f"Theorem {theorem}, {end} bound, {reading}{which}"] = name
+        samples = [100 * data[f"{example}:{name}"] for example in EXAMPLES]
+        rows[f"Theorem {theorem}, {end} bound, {reading}{which}"] = samples
     return {
         "examples": list(EXAMPLES),
-        "tables": {
-            "bounds": [
-                Number.from_sample(f"{row}: {example}", 100 * data[f"{example}:{name}"], unit="%")
-                for row, name in rows.items()
-                for example in EXAMPLES
-            ]
-        },
+        "tables": {"bounds": grid(EXAMPLES, rows, "%")},
         "ends": {
             f"{end}_{theorem}": _summarise_bound(data, f"{theorem}/{end}")
             for theorem in (4, 5)
@@ -384,6 +373,4 @@ def _summarise_bound(data: Data, bound: str) -> Data:
             shares = [data[key].mean() for key in data if f"{key}/".startswith(start)]
             by.setdefault(reading, []).append(float(max(shares)))
     best = min(by, key=lambda reading: sum(by[reading]))
-    return {
-        "printed": by["as printed"], "readings": len(by), "best": best, "shares": by[best],
-    }  # fmt: skip
+    return {"printed": by["as printed"], "readings": len(by), "best": best, "shares": by[best]}

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from agents.papers import checks
 from agents.papers import tobit_token_bucket_runs as runs
 from agents.papers.drawing import legend, stack
 from agents.papers.numbers import below, grid
-from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
+from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
 from agents.papers.tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
@@ -375,7 +376,7 @@ PAPER = Paper(
         "figure_10": PaperFigure("errors", partial(_draw_errors, sensor=2), (7.2, 5.4)),
     },
     "fusion_gym/TobitOscillator-v1",
-    {"policy": Parameter(TRIGGER, policy_of())},
+    {"policy": Parameter(TRIGGER, checks.policy_of())},
     (
         *("horizon", "token_rate", "token_capacity", "initial_tokens"),
         *("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial"),

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
+from agents.papers import checks
 from agents.papers import unknown_input_recursion as recursion
 from agents.papers.drawing import legend, set_ticks
 from agents.papers.numbers import below, estimate, grid
-from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
+from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
 from agents.papers.unknown_input_recursion import EXACT_CUTOFF
 from agents.papers.walk import walk
 from fusion_gym.arrays import Array
@@ -312,7 +313,6 @@ _STATES: Entries = {
     CARTS: ((0, "cart 1 (m)"), (2, "cart 2 (m)")),
 }
 _INPUTS: Entries = {PRINTED: ((2, "$d^1$"), (3, "$d^2$")), CARTS: ((4, "force (N)"),)}
-_TITLES = {PRINTED: "printed example", CARTS: "two carts"}
 _WALK = "Kalman filter, random-walk input"
 
 
@@ -340,7 +340,7 @@ def _curves(axis: Any, data: Data, example: str, entry: int) -> None:
 def _grid(figure: Any, data: Data, rows: int) -> Any:
     axes = figure.subplots(rows, 2, sharex=True, squeeze=False)
     for column, example in enumerate(EXAMPLES):
-        axes[0, column].set_title(_TITLES[example], loc="left")
+        axes[0, column].set_title(NAMES[example].removeprefix("the "), loc="left")
         axes[-1, column].set_xlabel("sampling instant k")
         axes[-1, column].set_xlim(0, len(_time(data)))
     return axes
@@ -452,6 +452,6 @@ PAPER = Paper(
         "figure_7": _figure(_draw_instants, 2.6),
     },
     "fusion_gym/UnknownInput-v1",
-    {"policy": Parameter(TRIGGER, policy_of(TRIGGER))},
+    {"policy": Parameter(TRIGGER, checks.policy_of(TRIGGER))},
     ("horizon", "rho_bar", "rho_initial", "adaptation"),
 )  # fmt: skip

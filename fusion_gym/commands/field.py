@@ -1,10 +1,12 @@
 r"""Say how rarely the sensors of a log may report, and what to type into them.
 
     fusion-gym field mast --exact --target-rate 0.05
+    fusion-gym field mast --exact --tolerance 0.5 --device zigbee
 
 The first part of the log determines a plant. Rules are tuned and an agent is trained on the plant
 with resampled residuals, and measured on the rest of the log. The report compares them at equal
-packets with what devices run, report on change with held values. It ends in ``reportable_change``,
+packets with what devices run, report on change with held values. With ``--tolerance`` it
+compares the least packets that keep your root mean square errors. It ends in ``reportable_change``,
 ``min_interval`` and ``max_interval`` for each sensor.
 
 The output folder contains ``report.html``, ``report.md``, two pictures, the option file
@@ -12,10 +14,14 @@ The output folder contains ``report.html``, ``report.md``, two pictures, the opt
 """
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from tempfile import TemporaryDirectory
+from threading import Event, Thread
+from typing import Annotated, cast
 
 import joblib
 import numpy as np
@@ -23,64 +29,48 @@ import tyro
 
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.fit import plant_text
+from fusion_gym.commands.log_options import FitOptions, warn
 from fusion_gym.commands.options import OUTPUT_FOLDER, between, whole
 from fusion_gym.entries import Options, Plain
-from fusion_gym.evaluation.field_study import (
-    ENV,
-    METHODS,
-    FieldStudy,
-    MethodPoint,
-    at_rate,
-    compare_with_practice,
-    measure,
-    point_at,
-    simulate_sizes,
-)
+from fusion_gym.errors import forbidden
+from fusion_gym.evaluation import field_study
+from fusion_gym.evaluation.devices import DeviceName, longest_interval, step_of
+from fusion_gym.evaluation.field_study import METHODS, PRACTICE, FieldStudy, MethodPoint, scale
+from fusion_gym.output import files
+from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.field_report import FieldReport, draw_card, draw_curves, write_report
-from fusion_gym.output.files import (
-    check_inputs,
-    folder_refusal,
-    lock_folder,
-    read_json,
-    write,
-    write_text,
-)
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.recordings import Recording, fit
-from fusion_gym.recordings.fitting import criticise, deviations, noisy_channels, warnings_of
+from fusion_gym.policies.settings import parse_settings, parse_value
+from fusion_gym.recordings import Recording, fit, fitting
 from fusion_gym.recordings.recording import SHIPPED
+from fusion_gym.training import config
 from fusion_gym.training.algorithms import settings
-from fusion_gym.training.config import (
-    EnvironmentConfig,
-    Experiment,
-    TrainingConfig,
-    ValidationConfig,
-)
 from fusion_gym.training.run import holds_training, train
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, number, refusal
 
 AGENT = "agent"
 _WINDOWS, _LONGEST, _SHORTEST = 60, 300, 20  # windows at least, and steps of a window
 _PRICES = 4.0  # ratio of the highest to the middle price of the agent
+_RATE, _START = 0.05, 1e-3  # target rate by default, and least rate of a tolerance
+_RUNS = 60, 220  # simulations of a method, about, without and with its own threshold a sensor
 _COMPLETE = 0.5  # of the steps, whose residuals can be resampled
 
 
 @dataclass(frozen=True)
-class Field(Long):
+class Field(FitOptions, Long):
     """Say how rarely the sensors of a log may report, and what to type into them."""
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
     """The CSV file, or mast or tanks; fusion-gym info shows its data card."""
-    target_rate: Annotated[float, between(0.0, 0.5)] = 0.05
-    """Packets a sensor and step at which rules are compared."""
+    target_rate: Annotated[float | None, between(0.0, 0.5)] = None
+    """Packets a sensor and step at which rules are compared; 0.05 without --tolerance."""
+    tolerance: tuple[str, ...] = ()
+    """Root mean square error that is allowed, in a channel's unit: a number for all channels, a
+    number for each, or NAME=NUMBER for each."""
+    device: DeviceName | None = None
+    """Device whose fields take the settings; its steps and limits hold in the study."""
     output: Annotated[Path, OUTPUT_FOLDER] = Path("runs/field")
     """Folder of the report."""
-    channels: tuple[str, ...] = ()
-    """Channels by name; by default all without a fault."""
-    share: Annotated[float, between(0.0, 0.95)] = 0.5
-    """Share of the log, from its start, for the fit."""
-    exact: bool = False
-    """The readings are the truth: fit no measurement noise."""
     timesteps: Annotated[int, whole(1, 10**9)] = 200_000
     """Steps of the agent's training."""
     workers: Annotated[int, whole(1, 512)] = 2
@@ -90,104 +80,159 @@ class Field(Long):
 
     def run(self) -> None:
         """Fit, tune, train, measure and report."""
-        whole = Recording.read(self.log)
-        recording = whole.select(self.channels)
-        inputs: Plain = {"log": joblib.hash(whole.values), "target_rate": self.target_rate}
+        whole = Recording.read(self.log, **self.reading)
+        recording = self.select(whole)
+        if self.tolerance and self.target_rate is not None:
+            raise forbidden("target_rate", self.target_rate, "--tolerance determines the rate")
+        rate = _START if self.tolerance else self.target_rate or _RATE
+        names = [channel.name for channel in recording.channels]
+        tolerance = tolerances(self.tolerance, names) if self.tolerance else ()
+        seconds = recording.interval.total_seconds()
+        longest = longest_interval(self.device, seconds) if self.device else math.inf
+        inputs: Plain = {"log": joblib.hash(whole.values), "device": self.device}
+        inputs |= {"tolerance": tolerance} if tolerance else {"target_rate": rate}
         inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
+        inputs |= {"on_change": self.on_change}
         place = self.output / "study.json"
         if place.exists() and not self.resume:
-            raise folder_refusal(self.output, "a study")
+            raise files.folder_refusal(self.output, "a study")
         if place.exists():
-            check_inputs(inputs, read_json(place, "output"), f"the study in {str(self.output)!r}")
+            before = files.read_json(place, "output")
+            files.check_inputs(inputs, before, f"the study in {str(self.output)!r}")
         plant = fit(recording, self.share, self.exact, order=1)  # a hold has no lags
-        if names := noisy_channels(plant):
+        if names := fitting.noisy_channels(plant):
             raise ConfigurationError(
                 f"exact = False is not allowed with this log: {', '.join(names)} have measurement "
                 "noise, so their readings are no truth; give --exact if they are"
             )
-        log = self.log if self.log in SHIPPED else str(Path(self.log).absolute())
-        values, rows = deviations(recording, self.share)
+        values, rows = fitting.deviations(recording, self.share)
         complete = float(np.isfinite(values[:rows]).all(axis=1).mean())
         horizon = int(np.clip((len(values) - rows) // _WINDOWS, _SHORTEST, _LONGEST))
         study = FieldStudy(
-            options=plant.options | {"log": log, "fit_share": self.share},
-            rate=self.target_rate,
-            shape=plant.typical_changes,
-            horizon=horizon,
-            source="resampled" if complete >= _COMPLETE else "normal",
+            options=plant.options | {"fit_share": self.share}, rate=rate,
+            shape=tolerance or plant.typical_changes, horizon=horizon,
+            source="resampled" if complete >= _COMPLETE else "normal", tolerance=tolerance,
+            steps=tuple(step_of(self.device, channel.unit) for channel in recording.channels),
+            longest=longest, trials=self.output / "trials",
         )  # fmt: skip
-        study.task("joint", "recorded")  # refuses before anything is written
-        criticism = criticise(plant, values[rows:])
-        with lock_folder(self.output, "output"):
+        log = self.log if self.log in SHIPPED else str(Path(self.log).absolute())
+        copy = None
+        if self.on_change or any(self.reading.values()):  # the study reads without options
+            copy = recording if self.on_change else whole
+            log = str(self.output.absolute() / "log.csv")
+        with TemporaryDirectory() as folder:  # refuses before anything is written
+            if copy is not None:
+                copy.write(Path(folder) / "log.csv")
+            study.task("joint", "recorded", log=log if copy is None else f"{folder}/log.csv")
+        study = replace(study, options={**study.options, "log": log})
+        criticism = fitting.criticise(plant, values[rows:])
+        warnings = [*recording.remarks, *plant.remarks]
+        warnings += fitting.warnings_of(plant, values[rows:], criticism)
+        warn(warnings)
+        with files.lock_folder(self.output, "output"):
             writing(("the report", self.output / "report.html"))
-            write(place, inputs)
-            write_text(self.output / "plant.yaml", plant_text(plant, recording, self.log, rows))
-            points = {
-                name: [MethodPoint(**point) for point in read_json(path, "output")["points"]]
-                for name, path in self.pieces(study)
-            }
+            if copy is not None:
+                copy.write(log)
+            files.write(place, inputs)
+            text = plant_text(plant, recording, self.log, rows)
+            files.write_text(self.output / "plant.yaml", text)
+            with ended_like_by_ctrl_c():
+                if tolerance:
+                    sizes = scale(study, PRACTICE, np.array(study.shape))
+                    rate = study.call(field_study.run_trial, PRACTICE, sizes, study.source).rate
+                    study = replace(study, rate=max(rate, _START))
+                paths = self.measure_methods(study)
+            read = {name: files.read_json(path, "output") for name, path in paths.items()}
+            points = {name: [MethodPoint(**p) for p in own["points"]] for name, own in read.items()}
             draw_card(whole, self.output / "card.png")
-            results = compare_with_practice(study, points)
+            results = [] if tolerance else field_study.compare_with_practice(study, points)
             draw_curves(study, points, self.output / "curves.png")
             report = FieldReport(
                 name=Path(self.log).name, whole=whole, recording=recording, study=study,
-                rows=rows, criticism=criticism,
-                warnings=(*plant.remarks, *warnings_of(plant, values[rows:], criticism)),
-                points=points, results=results,
+                rows=rows, criticism=criticism, warnings=warnings,
+                points=points, results=results, device=self.device,
             )  # fmt: skip
             print(write_report(report, self.output))
+            shutil.rmtree(self.output / "trials", ignore_errors=True)
 
-    def pieces(self, study: FieldStudy) -> Iterator[tuple[str, Path]]:
-        """Measure the methods that the folder lacks, and yield all with their files."""
-        names = [*METHODS, AGENT]
+    def measure_methods(self, study: FieldStudy) -> dict[str, Path]:
+        """Measure the methods that the folder lacks, and return the files of all."""
+        names = sorted([*METHODS, AGENT], key=lambda name: name != AGENT and not METHODS[name][1])
         paths = {name: self.output / f"{name.replace(', ', '_').replace(' ', '_')}.json"
-                 for name in names}  # fmt: skip
-        lacking = sorted(
-            (name for name, path in paths.items() if not path.exists()),
-            key=lambda name: name != AGENT and not METHODS[name][1],
-        )
-        calls = (
-            joblib.delayed(_measure)(study, name, paths[name], self.output, self.timesteps)
-            for name in lacking
-        )
-        with progress_bar(len(names), "methods", len(names) - len(lacking), unit="methods") as bar:
-            parallel = joblib.Parallel(self.workers, return_as="generator_unordered", batch_size=1)
-            for name in parallel(calls):
-                bar.say(name)
-                bar.update()
-        yield from paths.items()
+                 for name in [*METHODS, AGENT]}  # fmt: skip
+        calls = (joblib.delayed(_measure)(study, name, paths[name], self.output, self.timesteps)
+                 for name in names if not paths[name].exists())  # fmt: skip
+        total, over = sum(_RUNS[name != AGENT and METHODS[name][1]] for name in names), Event()
+        workers = joblib.Parallel(self.workers, return_as="generator_unordered", batch_size=1)
+        with progress_bar(total, "methods", _runs(study), unit="runs", most=20.0) as bar:
+
+            def watch() -> None:
+                while not over.wait(1.0):
+                    bar.reach(_runs(study))
+
+            Thread(target=watch, daemon=True).start()
+            try:
+                for name in workers(calls):
+                    bar.say(name)
+            finally:
+                over.set()
+            bar.reach(total)
+        return paths
+
+
+def tolerances(words: Sequence[str], names: Sequence[str]) -> tuple[float, ...]:
+    """Return the tolerance of each channel, from one number, one for each, or NAME=NUMBER."""
+    values = [parse_value(word) for word in words]
+    named = dict(zip(names, values * len(names) if len(values) == 1 else values, strict=False))
+    if any("=" in word for word in words):
+        named = parse_settings("tolerance", words)
+    if set(named) != set(names) or len(words) > len(names):
+        allowed = f"one number, or one for each of the channels {', '.join(names)}"
+        raise refusal("tolerance", list(words), allowed)
+    return tuple(number("tolerance", named[name], above=0.0) for name in names)
+
+
+def _runs(study: FieldStudy) -> int:
+    """Return the number of simulations that the folder holds."""
+    return len(list(cast(Path, study.trials).rglob("output.pkl")))
 
 
 def _measure(study: FieldStudy, name: str, path: Path, folder: Path, timesteps: int) -> str:
     """Measure one method, and write its points."""
     own = name == AGENT
-    points = train_agent(study, folder / "agent", timesteps) if own else measure(study, name)
-    write(path, {"points": [asdict(point) for point in points]})
+    points = (
+        train_agent(study, folder / "agent", timesteps) if own else field_study.measure(study, name)
+    )
+    files.write(path, {"points": [asdict(point) for point in points]})
     return name
 
 
 def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodPoint]:
     """Train a centralised scheduler, and measure it at five prices."""
+    free = replace(study, tolerance=())
+    sizes = (scale(free, "centralised", np.ones(1), factor) for factor in (0.7, 1.4))
     few, many = (
-        simulate_sizes(study, "centralised", at_rate(study, "centralised", np.ones(1), factor))
-        for factor in (0.7 * study.rate, 1.4 * study.rate)
+        study.call(field_study.run_trial, "centralised", own, study.source) for own in sizes
     )
-    middle = (few[0] - many[0]) / (many[1] - few[1]) / len(study.shape)
+    middle = (few.error - many.error) / (many.rate - few.rate) / len(study.shape)
     prices = [float(f"{middle * factor:.4g}") for factor in np.geomspace(1 / _PRICES, _PRICES, 5)]
     drawn: Options = {"cost_weight": "random", "price_range": [prices[0], prices[-1]]}
-    free = {"tokens": "unlimited", "token_cost": 1.0, "horizon": study.horizon, "filter": "joint",
-            "reward_scale": 1.0}  # fmt: skip
-    options = {**study.options, **free, **drawn, "source": study.source}
-    experiment = Experiment(
-        environment=EnvironmentConfig(id=ENV, options=json.loads(json.dumps(options))),
+    fixed = {"tokens": "unlimited", "token_cost": 1.0, "horizon": study.horizon,
+             "filter": "joint", "reward_scale": 1.0}  # fmt: skip
+    options = {**study.options, **fixed, **drawn, "source": study.source}
+    experiment = config.Experiment(
+        environment=config.EnvironmentConfig(
+            id=field_study.ENV, options=json.loads(json.dumps(options))
+        ),
         algorithm=settings({"name": "counterfactual_ppo", "n_steps": 8, "gamma": 0.99}),
-        training=TrainingConfig(timesteps=timesteps, num_envs=256, price_exponent=0.8),
-        validation=ValidationConfig(every=max(timesteps // 3, 1), episodes=64),
+        training=config.TrainingConfig(timesteps=timesteps, num_envs=256, price_exponent=0.8),
+        validation=config.ValidationConfig(every=max(timesteps // 3, 1), episodes=64),
         output=str(folder),
     )
     if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
         raise KeyboardInterrupt
     rule, priced = f"model:{folder / 'best_model.zip'}", {**drawn, "reward_scale": 1.0}
     return [
-        point_at(study, [price], "joint", priced, f"{rule},price={price!r}") for price in prices
+        study.call(field_study.point_at, [price], "joint", priced, f"{rule},price={price!r}")
+        for price in prices
     ]

@@ -16,53 +16,40 @@ import tyro
 import yaml
 
 from fusion_gym.commands.command_line import Command
-from fusion_gym.commands.options import OutputFile, between
+from fusion_gym.commands.log_options import FitOptions, warn
+from fusion_gym.commands.options import OutputFile
 from fusion_gym.output.field_report import RATIOS, criticism_rows
 from fusion_gym.output.files import write_text
-from fusion_gym.output.progress import remark, writing
+from fusion_gym.output.progress import writing
 from fusion_gym.output.tables import console, table_tables
-from fusion_gym.recordings import FittedPlant, Recording, fit
-from fusion_gym.recordings.fitting import (
-    criticise,
-    deviations,
-    noisy_channels,
-    residual_correlations,
-    warnings_of,
-)
+from fusion_gym.recordings import FittedPlant, Recording, fit, fitting
 from fusion_gym.version import __version__
 
 
 @dataclass(frozen=True)
-class Fit(Command):
+class Fit(FitOptions, Command):
     """Fit a plant to a log of sensors, and write the option file that system= takes."""
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
     """The CSV file, or mast or tanks; fusion-gym info shows its data card."""
     output: Annotated[Path, OutputFile(".yaml", ".yml")] = Path("plant.yaml")
     """The option file."""
-    channels: tuple[str, ...] = ()
-    """Channels by name; by default all without a fault."""
-    share: Annotated[float, between(0.0, 0.95)] = 0.5
-    """Share of the log, from its start, for the fit."""
-    exact: bool = False
-    """The readings are the truth: fit no measurement noise."""
 
     def run(self) -> None:
         """Fit, criticise and write."""
-        recording = Recording.read(self.log).select(self.channels)
+        recording = self.select(Recording.read(self.log, **self.reading))
         plant = fit(recording, self.share, self.exact)
-        values, rows = deviations(recording, self.share)
-        criticism = criticise(plant, values[rows:])
+        values, rows = fitting.deviations(recording, self.share)
+        criticism = fitting.criticise(plant, values[rows:])
         title = f"{', '.join(plant.names)}: order {plant.order}, fitted to {rows:,} steps"
         console().print(table_tables(title, RATIOS, criticism_rows(criticism)))
-        white = residual_correlations(plant, values[rows:])
+        white = fitting.residual_correlations(plant, values[rows:])
         text = ", ".join(f"{name} {value:.2f} (lag {lag})" for name, lag, value in white)
         print(f"largest correlations of residuals in ten lags: {text}")
-        warnings = warnings_of(plant, values[rows:], criticism)
-        for line in (*recording.remarks, *plant.remarks, *warnings):
-            remark(f"warning: {line}")
-        if names := noisy_channels(plant):
-            remark(f"measurement noise of {', '.join(names)}: their readings are no truth")
+        warnings = fitting.warnings_of(plant, values[rows:], criticism)
+        if names := fitting.noisy_channels(plant):
+            warnings.append(f"measurement noise of {', '.join(names)}: readings are no truth")
+        warn((*recording.remarks, *plant.remarks, *warnings))
         writing(("option file", self.output))
         write_text(self.output, plant_text(plant, recording, self.log, rows))
 

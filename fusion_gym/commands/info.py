@@ -20,6 +20,7 @@ from rich.markdown import Markdown, TableElement
 from rich.table import Table
 
 from fusion_gym.commands.command_line import Command
+from fusion_gym.commands.log_options import LogOptions
 from fusion_gym.commands.options import OutputFile
 from fusion_gym.docstrings import plain_marks
 from fusion_gym.envs.registration import present_id
@@ -30,7 +31,7 @@ from fusion_gym.validation import nearest, refusal
 
 
 @dataclass(frozen=True)
-class Info(Command):
+class Info(LogOptions, Command):
     """Show the page of an environment, rule, filter, signal, agent or config, or a log's card."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
@@ -48,8 +49,10 @@ class Info(Command):
         if name not in names and (is_log or Path(name).is_file()):
             self._show_log()
             return
-        if self.picture is not None:
-            raise refusal("picture", str(self.picture), "left out with a name that is no log")
+        picture = None if self.picture is None else str(self.picture)
+        for option, value in {"picture": picture, **self.reading}.items():
+            if value:
+                raise refusal(option, value, "left out with a name that is no log")
         if name not in names:
             hint = f"; did you mean {nearest(name, names)!r}?" if nearest(name, names) else ""
             raise refusal("name", name, f"a CSV file or a name of fusion-gym list{hint}")
@@ -61,7 +64,7 @@ class Info(Command):
         from fusion_gym.output.field_report import card_lines, card_table, draw_card
         from fusion_gym.recordings import Recording
 
-        recording = Recording.read(self.name)
+        recording = Recording.read(self.name, **self.reading)
         print("\n".join(card_lines(recording)))
         console().print(card_table(recording))
         if self.picture is not None:

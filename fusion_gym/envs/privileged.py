@@ -118,15 +118,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         outcome = self.batch.step(requests)
         observation, noise = self.batch.observe(self.view.local), self.batch.normals()
         self._observed = self.view.rows(observation)
-        result = alternatives(
-            before,
-            self._requests,
-            noise,
-            outcome,
-            observation,
-            self.batch.beliefs(),
-            self.view.local,
-        )
+        beliefs, local = self.batch.beliefs(), self.view.local
+        result = alternatives(before, self._requests, noise, outcome, observation, beliefs, local)
         reward = self._error_term(result.error) + result.communication
         self._branched = Branched(reward * scale, result.observation)
         return outcome

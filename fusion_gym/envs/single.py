@@ -13,22 +13,12 @@ from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
+from fusion_gym.envs import vector
 from fusion_gym.envs.drawing import Film, Frame, Window
-from fusion_gym.envs.vector import (
-    FRAMES_PER_SECOND,
-    RENDER_MODES,
-    Infos,
-    Specified,
-    checked_mode,
-    reset_infos,
-    reward_space,
-    rewards_of,
-    step_infos,
-)
 from fusion_gym.envs.views import SchedulerView
 
 
-class FusionEnv(Specified, gymnasium.Env[Any, Any]):
+class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
     """Run one episode of a task behind Gymnasium's interface.
 
     An episode ends at the task's horizon: by truncation, or with ``clock=True`` by termination.
@@ -56,16 +46,16 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
     """
 
     metadata = {  # noqa: RUF012
-        "render_modes": list(RENDER_MODES),
-        "render_fps": FRAMES_PER_SECOND,
+        "render_modes": list(vector.RENDER_MODES),
+        "render_fps": vector.FRAMES_PER_SECOND,
     }
 
     def __init__(self, task: Task, render_mode: str | None = None) -> None:
-        self.render_mode = checked_mode(type(self).__name__, render_mode)
+        self.render_mode = vector.checked_mode(type(self).__name__, render_mode)
         self.task = task
         self._film = None if self.render_mode is None else Film(task, 1)
         visible = self.render_mode == "human"
-        self._window = Window(type(self).__name__, FRAMES_PER_SECOND) if visible else None
+        self._window = Window(type(self).__name__, vector.FRAMES_PER_SECOND) if visible else None
         self.batch = EpisodeBatch(task, 1)
         self._seeded: np.random.Generator | None = None  # generator whose seed the batch uses
         self.view = SchedulerView(task)
@@ -73,11 +63,11 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         self.observation_space = self.view.space
         self.action_space = self.view.actions
         if task.vector_reward:
-            self.reward_space = reward_space()
+            self.reward_space = vector.reward_space()
 
     def reset(
         self, *, seed: int | None = None, options: Arguments | None = None
-    ) -> tuple[NDArray[np.float32], Infos]:
+    ) -> tuple[NDArray[np.float32], vector.Infos]:
         """Begin a new episode.
 
         Args:
@@ -103,9 +93,9 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         if self._film is not None:
             self._film.begin()
             self._show()
-        return self.batch.observe()[0], _first(reset_infos(self.task, 1))
+        return self.batch.observe()[0], _first(vector.reset_infos(self.task, 1))
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], Any, bool, bool, Infos]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], Any, bool, bool, vector.Infos]:
         """Make one step.
 
         Args:
@@ -125,9 +115,9 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
             self._film.record(self.batch, outcome)
             self._show()
         observation = self.batch.observe()[0]
-        infos = _first(step_infos(outcome))
+        infos = _first(vector.step_infos(outcome))
         ended, clock = bool(outcome.ended[0]), self.task.clock
-        reward = rewards_of(self.task, outcome)[0]
+        reward = vector.rewards_of(self.task, outcome)[0]
         if not self.task.vector_reward:
             reward = float(reward)
         return observation, reward, ended and clock, ended and not clock, infos
@@ -171,7 +161,7 @@ def _warn_of_single_steps() -> None:
     )
 
 
-def _first(infos: Infos) -> Infos:
+def _first(infos: vector.Infos) -> vector.Infos:
     """Return the info of the only run, each value with a ``dtype`` and without the batch axis.
 
     TorchRL reads the ``dtype``. A flag is an array of shape (), because Gymnasium's vector

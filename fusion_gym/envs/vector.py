@@ -109,10 +109,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         self._started = np.zeros(self.num_envs, dtype=np.bool_)
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: Arguments | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None, options: Arguments | None = None
     ) -> tuple[NDArray[np.float32], Infos]:
         """Begin new episodes in all runs, or in the runs of ``options["reset_mask"]``.
 
@@ -170,12 +167,8 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         if not options or "reset_mask" not in options:
             return self._everyone
         mask = options["reset_mask"]
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != (self.num_envs,)
-            or not mask.any()
-        ):
+        fits = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,)
+        if not (fits and mask.dtype == np.bool_ and mask.any()):
             raise ValueError(
                 f"reset_mask = {mask!r} is not allowed: it must be a NumPy array of bool, of shape "
                 f"({self.num_envs},), with at least one True"

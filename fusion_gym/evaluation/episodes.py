@@ -74,11 +74,7 @@ class EpisodeResults:
 
 
 def run_episodes(
-    task: Task,
-    policy: Policy,
-    episodes: int = 100,
-    seed: int = 0,
-    progress: Progress = None,
+    task: Task, policy: Policy, episodes: int = 100, seed: int = 0, progress: Progress = None
 ) -> EpisodeResults:
     """Run a policy on episodes with consecutive seeds from ``seed``.
 
@@ -110,11 +106,7 @@ def run_episodes(
 
 
 def run_several(
-    task: Task,
-    policies: Sequence[Policy],
-    episodes: int,
-    seed: int,
-    progress: Progress = None,
+    task: Task, policies: Sequence[Policy], episodes: int, seed: int, progress: Progress = None
 ) -> list[EpisodeResults]:
     """Run policies as :func:`run_episodes` does, those with one owner of beliefs in one batch.
 
@@ -308,20 +300,16 @@ def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
     """
     validation.integer("seed", seed, at_least=0)
     batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
-    rows: dict[str, list[NDArray[Any]]] = {field.name: [] for field in fields(Trajectory)}
+    rows, estimator = [], task.estimator
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
-        state = batch.delivered
-        mean = task.estimator.mean(state.estimate)
-        covariance = task.estimator.covariance(state.estimate)
-        rows["truth"].append(task.plant.truth(state.plant)[:, 0])
-        rows["mean"].append(mean[:, 0])
-        rows["variance"].append(linalg.diagonal(covariance)[:, 0])
-        rows["local_mean"].append(task.estimator.local_means(state.estimate)[..., 0])
-        rows["tokens"].append(batch.tokens[0])
-        rows["requested"].append(outcome.requested[:, 0])
-        rows["granted"].append(outcome.granted[:, 0])
-    return Trajectory(**{name: np.array(row) for name, row in rows.items()})
+        plant, estimate, *_ = batch.delivered
+        variance = linalg.diagonal(estimator.covariance(estimate))
+        means = estimator.mean(estimate), variance, estimator.local_means(estimate)
+        network = batch.tokens, outcome.requested, outcome.granted
+        values = task.plant.truth(plant), *means, *network
+        rows.append([np.array(value[..., 0]) for value in values])
+    return Trajectory(*map(np.array, zip(*rows, strict=True)))
 
 
 Runs = NDArray[np.int64]

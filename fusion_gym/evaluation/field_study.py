@@ -1,10 +1,16 @@
-"""Rules tuned on a fitted plant and measured on the held-out part of its log, at equal packets."""
+"""Rules tuned on a fitted plant and measured on the held-out part of its log.
 
-from collections.abc import Mapping, Sequence
+The target is a rate, at which errors are compared, or a tolerance, which the least packets keep.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from joblib import Memory
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import minimize
@@ -19,7 +25,7 @@ from fusion_gym.evaluation.metrics import LEVEL, RESAMPLES, Interval
 from fusion_gym.policies.registry import make_policy
 
 ENV = "fusion_gym/RecordedFusion-v1"
-FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the target rate
+FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the target rate, or of 1 / tolerance²
 PRACTICE = "practice"
 METHODS = {  # name: filter, and whether every sensor has its own threshold
     PRACTICE: ("hold", False),
@@ -36,16 +42,28 @@ _REACH = 3.0  # of the logarithm of a sensor's threshold, from the common scale
 _BLOCK = 5  # windows of a block of the bootstrap
 
 
+class Trial(NamedTuple):
+    """A method's error, packets a sensor and step, and each channel's root mean square error."""
+
+    error: float
+    rate: float
+    deviations: list[float]
+
+
 @dataclass(frozen=True)
 class FieldStudy:
-    """A log with its plant, and the rate at which rules are compared.
+    """A log with its plant, and the target of the rules.
 
     Args:
         options: options of RecordedFusion: plant, log and share.
         rate: packets a sensor and step.
-        shape: typical change of each channel in ten steps (sensors,), in its unit.
+        shape: thresholds of one scale (sensors,), in the channels' units.
         horizon: steps of a window.
         source: source of the process noise of tuning and training.
+        tolerance: largest root mean square error of each channel, in its unit; empty for the rate.
+        steps: step and largest value of each sensor's threshold; empty for any value.
+        longest: most steps between two reports that a device holds.
+        trials: folder of finished simulations; None for none.
     """
 
     options: Mapping[str, Any]
@@ -53,11 +71,40 @@ class FieldStudy:
     shape: tuple[float, ...]
     horizon: int
     source: str
+    tolerance: tuple[float, ...] = ()
+    steps: tuple[tuple[float, float], ...] = ()
+    longest: float = math.inf
+    trials: Path | None = None
 
     @property
     def max_interval(self) -> int:
         """Most steps between two reports: a tenth of the packets, if nothing changes."""
-        return round(10.0 / self.rate)
+        return int(min(round(10.0 / self.rate), self.longest))
+
+    def excess(self, deviations: Sequence[float]) -> float:
+        """Return the largest ratio of a channel's error and its tolerance."""
+        return float(np.max(np.asarray(deviations) / self.tolerance))
+
+    def sends_enough(self, trial: Trial, factor: float) -> bool:
+        """Return whether thresholds may grow: above a multiple of the rate, or in the tolerance."""
+        if self.tolerance:
+            return self.excess(trial.deviations) <= factor**-0.5
+        return trial.rate > factor * self.rate
+
+    def order(self, point: "MethodPoint") -> tuple[float, float]:
+        """Return what decides between points: to keep the tolerance, then few packets."""
+        return max(self.excess(point.deviations), 1.0), float(np.mean(point.rates))
+
+    def quantize(self, sizes: Array) -> Array:
+        """Return sizes as a device holds them, in its steps or else with four digits."""
+        limits = np.array(self.steps or [(0.0, math.inf)] * len(sizes))[: len(sizes)]
+        step = np.where(limits[:, 0] > 0.0, limits[:, 0], 10.0 ** (np.floor(np.log10(sizes)) - 3))
+        values = np.minimum(np.maximum(np.round(sizes / step), 1.0) * step, limits[:, 1])
+        return np.array([float(f"{value:.9g}") for value in values])
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return a function's result, which an interrupted study keeps."""
+        return Memory(self.trials, verbose=0).cache(function)(self, *arguments)
 
     def task(self, filter_name: str, source: str, **options: Any) -> Task:
         """Return the task of a filter, in which a packet costs one token."""
@@ -105,16 +152,19 @@ class MethodResult:
 
 
 def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
-    """Tune a method at the target rate, and measure it at rates around it."""
+    """Tune a method at the target, and measure it there and around it."""
     shape = np.ones(1) if name == "centralised" else np.array(study.shape)
-    middle = at_rate(study, name, shape, study.rate)
+    middle = scale(study, name, shape)
     if METHODS[name][1]:
         start = np.log(middle)
 
         def objective(change: Array) -> float:
-            error, rate = simulate_sizes(study, name, np.exp(start + change))
-            apart = np.log(max(rate, 1e-3 * study.rate) / study.rate)
-            return float(np.log(error) + 4.0 * apart**2)
+            trial = study.call(run_trial, name, np.exp(start + change), study.source)
+            rate = max(trial.rate, 1e-3 * study.rate) / study.rate
+            cost, ratio = trial.error, rate
+            if study.tolerance:
+                cost, ratio = rate, max(study.excess(trial.deviations), 1e-3)
+            return float(np.log(cost) + 4.0 * np.log(ratio) ** 2)
 
         # The common scale, and one sensor that speaks for the others: Powell ends in the nearest
         # minimum.
@@ -124,9 +174,12 @@ def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
         limits: Any = {"maxfev": _TRIALS, "xtol": 0.05, "ftol": 0.005}
         best = minimize(objective, first, method="Powell", bounds=bounds, options=limits)
         middle = np.exp(start + best.x)
-    sizes = [at_rate(study, name, middle, study.rate * factor, _NEAR) for factor in FACTORS]
+    sizes = [scale(study, name, middle, factor, _NEAR) for factor in FACTORS]
+    if study.tolerance:  # which the held-out part must keep
+        sizes[len(sizes) // 2] = scale(study, name, middle, 1.0, _FAR, "recorded")
     return [
-        point_at(study, own.tolist(), METHODS[name][0], *rule_of(study, name, own)) for own in sizes
+        study.call(point_at, own.tolist(), METHODS[name][0], *rule_of(study, name, own))
+        for own in map(study.quantize, sizes)
     ]
 
 
@@ -134,11 +187,11 @@ def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[Options, str]:
     """Return the options and the text of a method's rule."""
     if name == "centralised":
         return {}, f"value_of_information:threshold={float(sizes[0])!r},at_most=1"
-    text = "/".join(repr(float(f"{size:.4g}")) for size in sizes)
+    thresholds = study.quantize(sizes).tolist()
+    text = "/".join(map(repr, thresholds))
     rule = f"report_on_change:reportable_change={text},max_interval={study.max_interval}"
     if METHODS[name][0] != "truncated":
         return {}, rule
-    thresholds = [float(f"{size:.4g}") for size in sizes]
     return {"trigger": "report_on_change", "trigger_threshold": thresholds}, rule
 
 
@@ -161,37 +214,46 @@ def point_of(
 
     Errors on the windows are divided by the share of readings, because others count as zero.
     """
-    noise: Any = study.task("joint", "recorded").noise
-    squared = real.squared_error.mean(0)[: len(study.shape)] / noise.readings.mean(0)
+    squared = _squared(study, study.task("joint", "recorded"), real)
     weights = np.array(study.options["state_weights"])[: len(study.shape)]
     scale = float(weights @ squared) / max(float(real.error_cost.mean()), 1e-300)
-    return MethodPoint(
-        sizes,
-        float(simulated.error_cost.mean()),
-        (scale * real.error_cost).tolist(),
-        real.rate.tolist(),
-        np.sqrt(squared).tolist(),
-    )
+    errors, deviations = (scale * real.error_cost).tolist(), np.sqrt(squared).tolist()
+    simulated_error = float(simulated.error_cost.mean())
+    return MethodPoint(sizes, simulated_error, errors, real.rate.tolist(), deviations)
 
 
-def simulate_sizes(study: FieldStudy, name: str, sizes: Array) -> tuple[float, float]:
-    """Return error and rate in simulation, on the tuning episodes."""
+def _squared(study: FieldStudy, task: Task, results: EpisodeResults) -> Array:
+    """Return each channel's mean squared error (sensors,) at the steps with a reading."""
+    readings = getattr(task.noise, "readings", np.ones((1, len(study.shape)))).mean(0)
+    squared: Array = results.squared_error.mean(0)[: len(study.shape)] / readings
+    return squared
+
+
+def run_trial(study: FieldStudy, name: str, sizes: Array, source: str) -> Trial:
+    """Return the results on the tuning episodes, or on all windows of the held-out part."""
     options, rule = rule_of(study, name, sizes)
-    task = study.task(METHODS[name][0], study.source, **options)
-    results = run_episodes(task, make_policy(rule, task), _EPISODES, seeds.FIELD.start)
-    return float(results.error_cost.mean()), float(results.rate.mean())
+    task = study.task(METHODS[name][0], source, **options)
+    count = getattr(task.noise, "count", _EPISODES)
+    seed = 0 if source == "recorded" else seeds.FIELD.start
+    results = run_episodes(task, make_policy(rule, task), count, seed)
+    deviations = np.sqrt(_squared(study, task, results)).tolist()
+    return Trial(float(results.error_cost.mean()), float(results.rate.mean()), deviations)
 
 
-def at_rate(study: FieldStudy, name: str, shape: Array, rate: float, reach: float = _FAR) -> Array:
-    """Return sizes of this shape with the rate in simulation, within a factor exp(reach)."""
-    low, high, middle = -reach, reach, 0.0
+def scale(
+    study: FieldStudy, name: str, shape: Array, factor: float = 1.0, reach: float = _FAR,
+    source: str | None = None,
+) -> Array:  # fmt: skip
+    """Return the largest sizes of this shape, within a factor exp(reach), that send enough."""
+    low, high = -reach, reach
     while high - low > _CLOSE:
         middle = 0.5 * (low + high)
-        if simulate_sizes(study, name, np.exp(middle) * shape)[1] > rate:
+        trial = study.call(run_trial, name, np.exp(middle) * shape, source or study.source)
+        if study.sends_enough(trial, factor):
             low = middle
         else:
             high = middle
-    return np.exp(middle) * shape
+    return np.exp(low) * shape
 
 
 def compare_with_practice(
@@ -203,13 +265,9 @@ def compare_with_practice(
         study: the log.
         points: points of each method.
     """
-    curves = {
-        name: (
-            np.array([point.errors for point in own]),
-            np.array([np.mean(point.rates, axis=1) for point in own]),
-        )
-        for name, own in points.items()
-    }
+    curves = {name: (np.array([point.errors for point in own]),
+                     np.array([np.mean(point.rates, axis=1) for point in own]))
+              for name, own in points.items()}  # fmt: skip
     windows = curves[PRACTICE][0].shape[1]
     whole = np.arange(windows, dtype=np.int64)
     blocks = np.array_split(whole, max(windows // _BLOCK, 1))

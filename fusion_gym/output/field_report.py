@@ -1,23 +1,23 @@
 """Data cards of recordings, and the report of a field study: tables, pages, pictures, settings."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from markdown_it import MarkdownIt
+from matplotlib.ticker import LogLocator
 from rich.table import Table
 
+from fusion_gym.arrays import Array
 from fusion_gym.docstrings import table
-from fusion_gym.evaluation.field_study import (
-    METHODS,
-    PRACTICE,
-    FieldStudy,
-    MethodPoint,
-    MethodResult,
-)
+from fusion_gym.evaluation import field_study
+from fusion_gym.evaluation.devices import DEVICES, DeviceName, fields_of
+from fusion_gym.evaluation.field_study import METHODS, PRACTICE, MethodPoint, MethodResult
 from fusion_gym.output.figures import save_figure
 from fusion_gym.output.files import write_text
 from fusion_gym.output.palette import BLUE, READABLE, VERMILLION
@@ -55,8 +55,10 @@ def card_lines(recording: Recording) -> list[str]:
     return [
         f"from {index[0]} to {index[-1]}: {len(index):,} steps of {recording.interval}",
         f"gaps of all channels: {gaps}, the longest {longest}",
+        *(f"{card.channel.name}: recorded on change by {card.change:g}; silence is no missing "
+          "reading (--on-change)" for card in recording.card if card.change),
         *recording.remarks,
-    ]
+    ]  # fmt: skip
 
 
 def draw_card(recording: Recording, path: Path) -> None:
@@ -71,6 +73,7 @@ def draw_card(recording: Recording, path: Path) -> None:
         panel.plot(values.index, readings.where(edge), ".", ms=1, color=VERMILLION, rasterized=True)
         title = f"{channel.name} [{channel.unit}]" if channel.unit else channel.name
         panel.set_title(f"{title}: {card.fault}" if card.fault else title, loc="left")
+    panels[-1, 0].set_xlabel("time (UTC)")
     figure.tight_layout()
     save_figure(figure, path)
 
@@ -113,18 +116,35 @@ class FieldReport:
     name: str
     whole: Recording
     recording: Recording
-    study: FieldStudy
+    study: field_study.FieldStudy
     rows: int
     criticism: Sequence[Criticism]
     warnings: Sequence[str]
     points: Mapping[str, Sequence[MethodPoint]]
     results: Sequence[MethodResult]
+    device: DeviceName | None = None
 
     @property
-    def best(self) -> MethodResult:
-        """The method with the least error that needs no downlink."""
-        local = (row for row in self.results if row.name in METHODS and row.name != "centralised")
-        return min(local, key=lambda row: row.error)
+    def best(self) -> str:
+        """The method without a downlink that has the least error, or packets in the tolerance."""
+        local = [name for name in METHODS if name != "centralised"]
+        if self.study.tolerance:
+            return min(local, key=lambda name: self.study.order(self.point(name)))
+        errors = {row.name: row.error for row in self.results}
+        return min(local, key=errors.__getitem__)
+
+    def point(self, name: str) -> MethodPoint:
+        """Return a method's point at the target."""
+        points = self.points[name]
+        if self.study.tolerance:
+            return min(points, key=self.study.order)
+        return points[len(points) // 2]
+
+    def packets_a_day(self, name: str) -> Array:
+        """Return the packets a day of each sensor (sensors,)."""
+        steps = 86_400.0 / self.recording.interval.total_seconds()
+        result: Array = steps * np.mean(self.point(name).rates, axis=0)
+        return result
 
 
 def write_report(report: FieldReport, folder: Path) -> str:
@@ -132,26 +152,21 @@ def write_report(report: FieldReport, folder: Path) -> str:
     study, whole = report.study, report.whole
     best, windows = report.best, len(report.points[PRACTICE][0].errors)
     seconds, settings = report.recording.interval.total_seconds(), _settings(report)
-    devices = yaml.safe_dump(settings, sort_keys=False)
-    filter_name = METHODS[best.name][0]
+    devices = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
+    filter_name = METHODS[best][0]
     thresholds = [row["reportable_change"] for row in settings.values()]
     trigger = f' trigger="report_on_change", trigger_threshold={thresholds},'
     trigger = trigger if filter_name == "truncated" else ""
+    target = "the tolerance" if study.tolerance else f"{study.rate:g} packets a sensor and step"
     summary = [
-        f"## At {study.rate:g} packets a sensor and step",
-        f"{windows} windows of {study.horizon} steps, which were not fitted. Errors are shares of "
-        "the channels' variance; the difference is to practice at equal packets, with a 95 % "
-        "block-bootstrap interval.",
-        results_table(report.results),
-        "## Recommendation",
-        f"{MEANINGS[best.name]} No other method without a downlink has a smaller error. It is "
-        f"{-best.relative.mean:.0%} lower than practice's at equal packets "
-        f"({-best.relative.high:.0%} to {-best.relative.low:.0%}). For practice's error it takes "
-        f"{best.packets:.0%} of the packets.",
+        f"## At {target}",
+        f"{windows} windows of {study.horizon} steps, which were not fitted.",
+        *(_tolerance_lines(report) if study.tolerance else _rate_lines(report)),
         device_table(report),
+        *([] if report.device is None else [f"{report.device}: {DEVICES[report.device][2]}"]),
         f"Intervals are in seconds; a step is {seconds:g} s. `devices.yaml`:",
         f"```yaml\n{devices}```",
-        "The centre:",
+        "A simulation of the centre:",
         f"```python\nimport fusion_gym\n\ntask = fusion_gym.make_task(\n"
         '    "fusion_gym/LinearFusion-v2", system="plant.yaml", tokens="unlimited",\n'
         f'    filter="{filter_name}",{trigger}\n)\n```',
@@ -182,6 +197,41 @@ def write_report(report: FieldReport, folder: Path) -> str:
     return "\n\n".join(summary)
 
 
+def _rate_lines(report: FieldReport) -> list[str]:
+    """Return the results and the recommendation at equal packets."""
+    best = next(row for row in report.results if row.name == report.best)
+    return [
+        "Errors are shares of the channels' variance; the difference is to practice at equal "
+        "packets, with a 95 % block-bootstrap interval.",
+        results_table(report.results),
+        "## Recommendation",
+        f"{MEANINGS[best.name]} No other method without a downlink has a smaller error. It is "
+        f"{-best.relative.mean:.0%} lower than practice's at equal packets "
+        f"({-best.relative.high:.0%} to {-best.relative.low:.0%}). For practice's error it takes "
+        f"{best.packets:.0%} of the packets.",
+    ]
+
+
+def _tolerance_lines(report: FieldReport) -> list[str]:
+    """Return the packets in the tolerance and the recommendation."""
+    study, rows = report.study, []
+    pairs = zip(report.recording.channels, study.tolerance, strict=True)
+    listed = ", ".join(f"{c.name} {value:g} {c.unit}".strip() for c, value in pairs)
+    for name in report.points:
+        excess = study.excess(report.point(name).deviations)
+        packets = f"{report.packets_a_day(name).sum():.1f}"
+        rows.append((name, packets if excess <= 1.0 else "not reached", f"{excess:.2f}"))
+    answer = "No other method without a downlink keeps the tolerance with fewer packets."
+    if study.order(report.point(report.best))[0] > 1.0:
+        answer = "**No setting keeps the tolerance**; the errors below are the least."
+    return [
+        f"Root mean square errors that are allowed: {listed}. Packets are those of all sensors.",
+        table(("method", "packets a day", "largest error over its tolerance"), rows),
+        "## Recommendation",
+        f"{MEANINGS[report.best]} {answer}",
+    ]
+
+
 def results_table(results: Sequence[MethodResult]) -> str:
     """Return the table of the methods."""
     heads = ("method", "error", "difference to practice", "packets at practice's error",
@@ -198,24 +248,25 @@ def results_table(results: Sequence[MethodResult]) -> str:
 
 def device_table(report: FieldReport) -> str:
     """Return the table of the recommended settings, beside practice's thresholds."""
-    point, practice = (_middle(report.points[name]) for name in (report.best.name, PRACTICE))
-    day = 86_400.0 / report.recording.interval.total_seconds()
-    seconds = report.recording.interval.total_seconds()
-    rates = np.mean(point.rates, axis=0)
+    point, practice = report.point(report.best), report.point(PRACTICE)
+    day, rows = report.packets_a_day(report.best), []
     heads = ("sensor", "reportable_change", "min_interval", "max_interval", "packets a day",
-             "error (rms)", "practice's reportable_change")  # fmt: skip
-    rows = []
-    for place, channel in enumerate(report.recording.channels):
-        unit = f" {channel.unit}" if channel.unit else ""
+             "error (rms)", "practice's reportable_change",
+             *([f"{report.device} fields"] if report.device else []))  # fmt: skip
+    for place, (name, row) in enumerate(_settings(report).items()):
+        unit = f" {report.recording.channels[place].unit}".rstrip()
         rows.append((
-            channel.name, f"{point.thresholds[place]:.3g}{unit}", f"{seconds:g} s",
-            f"{report.study.max_interval * seconds:g} s", f"{rates[place] * day:.1f}",
-            f"{point.deviations[place]:.3g}{unit}", f"{practice.thresholds[place]:.3g}{unit}",
+            name, f"{row['reportable_change']:.4g}{unit}", f"{row['min_interval']:g} s",
+            f"{row['max_interval']:g} s", f"{day[place]:.1f}",
+            f"{point.deviations[place]:.3g}{unit}", f"{practice.thresholds[place]:.4g}{unit}",
+            *([json.dumps(row[report.device], ensure_ascii=False)] if report.device else []),
         ))  # fmt: skip
     return table(heads, rows)
 
 
-def draw_curves(study: FieldStudy, points: Mapping[str, Sequence[MethodPoint]], path: Path) -> None:
+def draw_curves(
+    study: field_study.FieldStudy, points: Mapping[str, Sequence[MethodPoint]], path: Path
+) -> None:
     """Draw error over packets of every method on the held-out part."""
     plt.rcParams.update(READABLE)
     figure, panel = plt.subplots(figsize=(7.5, 4.8))
@@ -223,9 +274,11 @@ def draw_curves(study: FieldStudy, points: Mapping[str, Sequence[MethodPoint]], 
         rates = [np.mean(point.rates) for point in own]
         errors = [np.mean(point.errors) for point in own]
         panel.loglog(rates, errors, "o-", ms=4, label=name)
-    panel.axvline(study.rate, color="grey", lw=1, ls=":")
+    if not study.tolerance:
+        panel.axvline(study.rate, color="grey", lw=1, ls=":")
     panel.set(xlabel="packets a sensor and step", ylabel="error, as a share of the variance")
     for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
     panel.legend(fontsize=8)
@@ -233,20 +286,15 @@ def draw_curves(study: FieldStudy, points: Mapping[str, Sequence[MethodPoint]], 
     save_figure(figure, path)
 
 
-def _settings(report: FieldReport) -> dict[str, dict[str, float]]:
-    """Return the settings of each sensor, in the unit of its readings and in seconds."""
-    point = _middle(report.points[report.best.name])
-    seconds = report.recording.interval.total_seconds()
-    return {
-        channel.name: {
-            "reportable_change": float(f"{point.thresholds[place]:.4g}"),
-            "min_interval": seconds,
-            "max_interval": report.study.max_interval * seconds,
-        }
-        for place, channel in enumerate(report.recording.channels)
-    }
-
-
-def _middle(points: Sequence[MethodPoint]) -> MethodPoint:
-    """Return the point that was tuned for the target rate."""
-    return points[len(points) // 2]
+def _settings(report: FieldReport) -> dict[str, dict[str, Any]]:
+    """Return the settings of each sensor in its unit and in seconds, and the device's fields."""
+    result: dict[str, dict[str, Any]] = {}
+    least = report.recording.interval.total_seconds()
+    most = report.study.max_interval * least
+    thresholds = report.point(report.best).thresholds
+    for channel, change in zip(report.recording.channels, thresholds, strict=True):
+        row = {"reportable_change": change, "min_interval": least, "max_interval": most}
+        result[channel.name] = row
+        if report.device:
+            row[report.device] = fields_of(report.device, channel.unit, change, least, most)
+    return result

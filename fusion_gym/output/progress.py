@@ -46,19 +46,17 @@ _COUNT = TextColumn(
 )
 _CLOCK = _Clock(Column(no_wrap=True))
 _COLUMNS = (
-    TextColumn("{task.description}", markup=False),
-    BarColumn(20),
-    _COUNT,
-    _CLOCK,
+    TextColumn("{task.description}", markup=False), BarColumn(20), _COUNT, _CLOCK,
     TextColumn("{task.fields[note]}", markup=False, table_column=Column()),
-)
+)  # fmt: skip
 
 
 class Bar:
     """The progress of a piece of work, in a task of rich; ``plain`` prints lines."""
 
-    def __init__(self, progress: Progress, task: Task, plain: bool) -> None:
+    def __init__(self, progress: Progress, task: Task, plain: bool, most: float = _MOST) -> None:
         self.task, self._progress, self.plain, self._due = task, progress, plain, _EVERY
+        self._most = most
 
     def update(self, amount: float = 1.0) -> None:
         """Add an amount to what is done."""
@@ -71,7 +69,7 @@ class Bar:
         reached = elapsed if done > self.task.completed else self.task.fields["reached"]
         self._progress.update(self.task.id, completed=done, reached=reached)
         if self.plain and elapsed >= self._due:
-            self._due = elapsed + min(max(_EVERY, _SHARE * elapsed), _MOST)
+            self._due = elapsed + min(max(_EVERY, _SHARE * elapsed), self._most)
             remark(self.line())
 
     def say(self, note: str) -> None:
@@ -86,9 +84,13 @@ class Bar:
 
 @contextlib.contextmanager
 def progress_bar(
-    total: float, description: str, initial: float = 0.0, quiet: bool = False, unit: str = "steps"
-) -> Iterator[Bar]:
-    """Show a bar inside the context, below the bars of outer contexts."""
+    total: float, description: str, initial: float = 0.0, quiet: bool = False, unit: str = "steps",
+    most: float = _MOST,
+) -> Iterator[Bar]:  # fmt: skip
+    """Show a bar inside the context, below the bars of outer contexts.
+
+    Without a terminal there are at most ``most`` seconds between two lines.
+    """
     silent = quiet or is_quiet()
     drawn = not silent and sys.stderr.isatty() and not _CONSOLE.is_dumb_terminal
     outer = _DRAWN.get() if drawn else None
@@ -100,7 +102,7 @@ def progress_bar(
         description, total=total, unit=unit, initial=initial, reached=0.0, note=""
     )
     progress.update(task, completed=initial)
-    bar = Bar(progress, progress.tasks[-1], plain=not (silent or drawn))
+    bar = Bar(progress, progress.tasks[-1], plain=not (silent or drawn), most=most)
     token = _DRAWN.set(progress if drawn else _DRAWN.get())
     with contextlib.nullcontext() if outer else progress:
         try:

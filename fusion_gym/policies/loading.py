@@ -20,15 +20,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from fusion_gym import validation
 from fusion_gym.core.task import ACTION_KINDS, Task
 from fusion_gym.envs.views import View, make_view, space_text
+from fusion_gym.policies import card
 from fusion_gym.policies.archive import NeedsTrust, read_plain, read_weights
-from fusion_gym.policies.card import (
-    ACTIVATIONS,
-    ALGORITHMS,
-    POLICIES,
-    Blueprint,
-    ModelView,
-    algorithm_of,
-)
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError
@@ -62,7 +55,7 @@ def load_model_policy(
     file = model_file(path)
     try:
         data = read_plain(file)
-        observed = ModelView.read(data)
+        observed = card.ModelView.read(data)
         # On-policy algorithms keep an observation before normalization under VecNormalize alone.
         normalized = "gae_lambda" in data and data.get("_last_original_obs") is not None
         if normalize is None and normalized:
@@ -106,10 +99,10 @@ def model_file(path: str) -> Path:
 
 
 def _rebuilt(
-    file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
+    file: Path, data: Mapping[str, Any], task: Task, observed: card.ModelView
 ) -> tuple[BaseAlgorithm, str]:
     """Return the model from its card and its weights, and its kind of action."""
-    blueprint, weights = Blueprint.read(data), read_weights(file)
+    blueprint, weights = card.Blueprint.read(data), read_weights(file)
     network = NetworkShape.of_weights(weights)
     if blueprint.network not in (None, network.plain()):
         raise ConfigurationError(f"its card's network differs from its weights, {network.plain()}")
@@ -117,8 +110,8 @@ def _rebuilt(
         raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}")
     action, view = _fitted(task, observed, (network.entries,), blueprint.actions)
     # Without environment, buffers and optimiser, so it cannot learn.
-    kind: Any = ALGORITHMS[blueprint.algorithm]
-    base = POLICIES[blueprint.algorithm]
+    kind: Any = card.ALGORITHMS[blueprint.algorithm]
+    base = card.POLICIES[blueprint.algorithm]
     model = kind(base, env=None, device="cpu", _init_setup_model=False)
     model.observation_space, model.action_space = view.space, view.actions
     model.policy = _policy(blueprint, network, view)
@@ -133,28 +126,28 @@ def _rebuilt(
     return model, action
 
 
-def _policy(blueprint: Blueprint, network: NetworkShape, view: View) -> Any:
+def _policy(blueprint: card.Blueprint, network: NetworkShape, view: View) -> Any:
     """Return the policy with arbitrary weights, without use of torch's global random numbers."""
-    kind: Any = POLICIES[blueprint.algorithm]
+    kind: Any = card.POLICIES[blueprint.algorithm]
     with torch.random.fork_rng(devices=[]):
         return kind(
             view.space,
             view.actions,
             lr_schedule=lambda _: 0.0,
-            activation_fn=ACTIVATIONS[blueprint.activation],
+            activation_fn=card.ACTIVATIONS[blueprint.activation],
             optimizer_class=lambda *_, **__: None,
             **network.arguments(),
         )
 
 
 def _unpickled(
-    file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
+    file: Path, data: Mapping[str, Any], task: Task, observed: card.ModelView
 ) -> tuple[BaseAlgorithm, str]:
     """Return the model from the loader of Stable-Baselines3, which runs code of the file."""
     problems = []
     for name in _candidates(data):
         try:
-            model = ALGORITHMS[name].load(file, device="cpu")
+            model = card.ALGORITHMS[name].load(file, device="cpu")
         except Exception as error:  # the file's code may raise any error
             problems.append(f"{name}: {error}")
             continue
@@ -165,20 +158,20 @@ def _unpickled(
 
 def _candidates(data: Mapping[str, Any]) -> list[str]:
     """Return the algorithms of both libraries that may have saved the file."""
-    received, described = algorithm_of(data), data.get("policy_class")
-    if received in ALGORITHMS:
+    received, described = card.algorithm_of(data), data.get("policy_class")
+    if received in card.ALGORITHMS:
         return [received]
     module = described.get("__module__") if isinstance(described, dict) else None
     result = [
         name
-        for name, kind in ALGORITHMS.items()
+        for name, kind in card.ALGORITHMS.items()
         if any(policy.__module__ == module for policy in kind.policy_aliases.values())
     ]
     return result or (["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"])
 
 
 def _fitted(
-    task: Task, observed: ModelView, shape: tuple[int, ...], actions: str
+    task: Task, observed: card.ModelView, shape: tuple[int, ...], actions: str
 ) -> tuple[str, View]:
     """Return the model's kind of action, and the view of the task with it."""
     view, names = make_view(task, observed.local), observed.observation_names

@@ -93,11 +93,7 @@ class PeriodicOptimum(Stateless):
     knowledge: ClassVar[Knowledge] = "clock"
 
     def __init__(
-        self,
-        task: Task,
-        packets: int = 4,
-        period: int = 6,
-        average: str = "steady",
+        self, task: Task, packets: int = 4, period: int = 6, average: str = "steady"
     ) -> None:
         validation.integer("period", period, at_least=1, at_most=validation.MOST_STEPS)
         validation.integer("packets", packets, at_least=1, at_most=period * task.sensors)

@@ -82,10 +82,7 @@ _SHIPPED: dict[Kind, dict[str, str]] = {
         "value_of_information": "rules.beliefs:ValueOfInformation",
         "whittle": "optimal:WhittleIndex",
     },
-    "agent": {
-        "model": "saved:saved_agent",
-        "zoo": "saved:zoo_agent",
-    },
+    "agent": {"model": "saved:saved_agent", "zoo": "saved:zoo_agent"},
 }
 _ROWS = {
     name: PolicyRow(f"fusion_gym.policies.{place}", kind)

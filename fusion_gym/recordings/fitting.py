@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,10 @@ _ROWS = 3000  # of a maximum-likelihood fit; least squares takes all
 _CYCLE = pd.Timedelta("7D"), pd.Timedelta("6h")  # least fitted time, longest interval
 _RADIUS = 0.9999  # largest spectral radius of a fitted plant
 _LEAST = 50  # complete steps of a fit, for each number in a row of the regression
+_DEVIATION = 1e-7, 1e7  # whose squares LinearFusion allows
+_CONSTANT = 1e-9  # deviation over the largest reading of a constant channel, at most
+_EXACT = 1e-10  # variance of measurement noise over a channel's variance, at least
+_DEPENDENT = 1e-7  # singular value of channels that determine each other, over the rows
 _REGULAR = 1e-10  # least eigenvalue of the correlations of process noise
 _CORRELATION = 0.25  # of residuals in the first ten lags: above it, a warning
 
@@ -75,10 +79,16 @@ class FittedPlant:
 
     @property
     def options(self) -> Options:
-        """The options of LinearFusion; an error of a standard deviation costs 1 / channels."""
+        """The options of LinearFusion; an error of a standard deviation costs 1 / channels.
+
+        Raises:
+            ConfigurationError: a deviation below 1e-7 or above 1e7; choose another unit.
+        """
         count, size = len(self.names), len(self.transition)
-        weights = np.zeros(size)
-        weights[:count] = 1.0 / np.diagonal(self.stationary_covariance)[:count] / count
+        weights, variance = np.zeros(size), np.diagonal(self.stationary_covariance)[:count]
+        for name, value in zip(self.names, np.sqrt(variance).tolist(), strict=True):
+            number(f"deviation of {name}", value, at_least=_DEVIATION[0], at_most=_DEVIATION[1])
+        weights[:count] = 1.0 / variance / count
         lags = (f"_lag{lag}" if lag else "" for lag in range(self.order))
         return {
             "state_names": [f"{name}{lag}" for lag in lags for name in self.names],
@@ -209,30 +219,50 @@ def fit(
         1
     """
     share = number("share", share, above=0.0, at_most=0.95)
+    card = recording.card
+    if changes := [f"{c.channel.name} by {c.change:g}" for c in card if c.change]:
+        raise ConfigurationError(
+            f"on_change = False is not allowed with this log, which is recorded on change "
+            f"({', '.join(changes)}): silence is no missing reading; give --on-change (hold())"
+        )
     values, rows = deviations(recording, share)
     least = _LEAST * (1 + len(recording.channels))
-    for channel, column in zip(recording.channels, values[:rows].T, strict=True):
-        known = column[np.isfinite(column)]
-        integer(f"readings of {channel.name} in the fitted part", len(known), at_least=least)
-        number(f"deviation of {channel.name}", float(known.std()), at_least=1e-6)
+    scale = np.ones(len(recording.channels))
+    for place, (name, readings) in enumerate(recording.values[:rows].items()):
+        known = np.isfinite(values[:rows, place])
+        integer(f"readings of {name} in the fitted part", int(known.sum()), at_least=least)
+        scale[place] = values[:rows][known, place].std()
+        if scale[place] <= _CONSTANT * readings.abs().max():
+            raise refusal("channels", name, "channels that change in the fitted part")
+    values = values / scale
+    resolution = np.array([0.0 if exact else row.resolution for row in card])
+    floor = np.maximum(_EXACT, (resolution / scale) ** 2 / 12.0)
     train, validation = values[: 2 * rows // 3], values[2 * rows // 3 : rows]
+    whole = values[:rows][np.isfinite(values[:rows]).all(axis=1)]
     errors: dict[int, float] = {}
-    if order is None and not exact:
-        order = 1  # readings hardly tell noise from a second lag
+    order = order or (None if exact else 1)  # readings hardly tell noise from a second lag
     try:
+        if len(whole) > len(scale) > np.linalg.matrix_rank(whole, tol=_DEPENDENT * len(whole)):
+            raise np.linalg.LinAlgError
         for lags in _ORDERS if order is None else ():
-            plant = _fit(recording, train, lags, exact)
+            plant = _fit(recording, train, lags, exact, floor)
             errors[lags] = criticise(plant, validation, (_TARGET,))[0].real
-        good = _CLOSE * min(errors.values(), default=0.0)
-        order = order or next(lags for lags, error in errors.items() if error <= good)
-        plant = _fit(recording, values[:rows], order, exact)
+        good = _CLOSE * float(np.nanmin([*errors.values(), np.inf]))
+        order = order or next(lags for lags, error in errors.items() if not error > good)
+        plant = _fit(recording, values[:rows], order, exact, floor)
         size = np.sqrt(np.diagonal(plant.process_covariance)[: values.shape[1]])
         own = plant.process_covariance[: len(size), : len(size)] / np.outer(size, size)
         np.linalg.cholesky(own - _REGULAR * np.eye(len(size)))
-    except np.linalg.LinAlgError as error:
-        allowed = f"some that do not determine each other ({error})"
+    except np.linalg.LinAlgError:
+        allowed = "some that do not determine each other"
         raise refusal("channels", list(recording.values), allowed) from None
-    return plant
+    sizes = np.tile(scale, order)
+    return replace(
+        plant,
+        transition=plant.transition * np.divide.outer(sizes, sizes),
+        process_covariance=plant.process_covariance * np.outer(sizes, sizes),
+        measurement_variance=plant.measurement_variance * scale**2,
+    )
 
 
 def criticise(
@@ -331,9 +361,9 @@ def _is_complete(values: Array) -> bool:
     return float((complete[1:] & complete[:-1]).mean()) > 0.5
 
 
-def _fit(recording: Recording, values: Array, order: int, exact: bool) -> FittedPlant:
+def _fit(recording: Recording, values: Array, order: int, exact: bool, noise: Array) -> FittedPlant:
+    """Return the plant of scaled deviations, with at least the variances ``noise`` (channels,)."""
     count, remarks = values.shape[1], []
-    noise = np.array([max(row.resolution**2 / 12.0, 1e-12) for row in recording.card])
     if exact and _is_complete(values):
         lags = np.hstack([values[order - lag : len(values) - lag] for lag in range(1, order + 1)])
         now = values[order:]
@@ -348,6 +378,9 @@ def _fit(recording: Recording, values: Array, order: int, exact: bool) -> Fitted
         residuals = now - lags @ coefficients.T
         process = residuals.T @ residuals / (len(now) - np.linalg.matrix_rank(lags))
     else:
+        values, few = _fullest(values), _LEAST * (1 + count)
+        for name, readings in zip(recording.values, np.isfinite(values).sum(0), strict=True):
+            integer(f"readings of {name} in {len(values):,} steps", int(readings), at_least=few)
         coefficients, process, noise = _expectation_maximisation(values, order, noise, exact)
     transition = np.eye(count * order, k=-count)
     transition[:count] = coefficients
@@ -361,6 +394,14 @@ def _fit(recording: Recording, values: Array, order: int, exact: bool) -> Fitted
     return FittedPlant(words(recording), transition, covariance, noise, order, tuple(remarks))
 
 
+def _fullest(values: Array) -> Array:
+    """Return the neighbouring steps with the most readings of the channel that has the fewest."""
+    most = min(_ROWS, len(values))
+    fewest = pd.DataFrame(np.isfinite(values)).rolling(most).sum().min(axis=1)
+    last = len(values) - int(np.argmax(fewest.fillna(-1.0)[::-1]))
+    return values[last - most : last]
+
+
 def _expectation_maximisation(
     values: Array, order: int, noise: Array, exact: bool
 ) -> tuple[Array, Array, Array]:
@@ -369,7 +410,6 @@ def _expectation_maximisation(
     Source: R. H. Shumway and D. S. Stoffer, "An approach to time series smoothing and forecasting
     using the EM algorithm", Journal of Time Series Analysis 3, 1982.
     """
-    values = values[-_ROWS:]
     count = values.shape[1]
     size, variance, last = count * order, np.nanvar(values, axis=0), -np.inf
     names = tuple(map(str, range(count)))

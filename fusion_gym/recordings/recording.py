@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import groupby
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pandas.io.common import get_handle
 
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, display, refusal
-from fusion_gym.validation import LARGEST, LONGEST, LONGEST_TEXT
+from fusion_gym.recordings import judging, reading
+from fusion_gym.validation import LARGEST, number
 
 # Shipped logs by name: three made-up tanks, and a wind mast (from brightwind 2.7.0, MIT).
 SHIPPED = {name: Path(__file__).with_name(f"{name}.csv{end}")
@@ -30,8 +26,6 @@ _HEAD = re.compile(
     r"(?P<name>[^\[\]]*?[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?"
     rf"(\s+(?P<low>{_LIMIT})?\.\.(?P<high>{_LIMIT})?)?"
 )
-_LEAST, _MOST = 20, 5_000_000  # rows of a log, and steps from its first to its last time
-_OFF = 0.05  # of an interval: a time that is farther from the even times is counted
 _SATURATED = 0.01  # share of readings at an extreme value that is a limit
 _STUCK = 12  # equal readings in a row, at least, of a channel that is stuck
 _SPIKE = 12.0  # robust deviations of the changes between readings
@@ -77,6 +71,8 @@ class ChannelCard:
         spikes: readings far from both neighbours.
         agreement: correlation with the median of the channels of its unit; NaN without two others.
         fault: reason why the channel is not used; empty if it is.
+        change: least change, in the channel's unit, of a channel recorded on change; zero if it
+            is recorded at even times.
 
     Example:
         >>> from fusion_gym.recordings import Recording
@@ -96,6 +92,7 @@ class ChannelCard:
     spikes: int
     agreement: float
     fault: str = ""
+    change: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,48 +116,66 @@ class Recording:
     remarks: tuple[str, ...] = ()
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Recording:
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        date_format: str | None = None,
+        time_unit: str | None = None,
+        error_codes: Sequence[float] = (),
+    ) -> Recording:
         """Read a log from a CSV file.
 
-        The first column has the times. The head of every other column is the name of a channel,
-        its unit in brackets and its limits: ``humidity [%] 0..100``; unit and limits may be left
-        out. An empty cell is no reading. Times are rounded to multiples of the most frequent
-        interval.
+        A column has the times. The head of every other column is the name of a channel, its unit in
+        brackets and its limits: ``humidity [%] 0..100``; unit and limits may be left out. A file
+        with one row a reading has a column of times, of names and of values. An empty cell, a word
+        and an error code are no reading. Columns of words are left out. Times are rounded to
+        multiples of the channels' median interval.
 
         Args:
             path: the file, which may be compressed, or the name of a shipped log: ``"tanks"`` or
                 ``"mast"``.
+            date_format: format of the times for ``strftime``. By default all rows decide the order
+                of day and month.
+            time_unit: unit of numeric times: ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, ``"min"``,
+                ``"h"``, ``"d"`` or ``"excel"``. By default the head names it.
+            error_codes: values that are no readings, beside those that are recognised.
 
         Raises:
             ConfigurationError: the file cannot be read as a log.
         """
         if not isinstance(path, str | os.PathLike):
             raise refusal("log", path, "the path of a CSV file")
-        table, source = _table(SHIPPED.get(str(path), Path(path))), f"log = {os.fspath(path)!r}"
-        channels = [_channel(str(head), source) for head in table.columns[1:]]
+        if time_unit is not None and time_unit not in reading.TIME_UNITS:
+            raise refusal("time_unit", time_unit, f"one of {', '.join(reading.TIME_UNITS)}")
+        codes = [number("error_codes", code) for code in error_codes]
+        source, remarks = f"log = {os.fspath(path)!r}", list[str]()
+        cells = reading.read_cells(SHIPPED.get(str(path), Path(path)), remarks)
+        times, table = reading.split_times(cells, source, date_format, time_unit, remarks)
+        times, table = reading.pivoted(times, table, source, remarks)
+        channels = [_channel(str(head), source) for head in table.columns]
         names = [channel.name for channel in channels]
         if len(set(names)) < len(names) or not names:
             raise ConfigurationError(
-                f"{source} is not allowed: its channels are {names}, and it must have one or more "
-                "different ones after the column of times"
+                f"{source} is not allowed: its channels are {names}, and must be different ones"
             )
-        numbers = table.iloc[:, 1:].set_axis(names, axis=1)
-        texts, remarks = numbers.notna(), list[str]()
-        times = _times(table.iloc[:, 0], source, remarks)
-        for name in names:
-            if not pd.api.types.is_numeric_dtype(numbers[name]):
-                plain = numbers[name].astype("string").str.strip().str.replace(",", ".")
-                numbers[name] = pd.to_numeric(plain, errors="coerce")
-        numbers = numbers.astype(float).where(numbers.astype(float).abs() <= LARGEST)
-        lost = int((texts & numbers.isna()).to_numpy().sum())
+        numbers, units = reading.numbers_of(table.set_axis(names, axis=1), source)
+        numbers[np.abs(numbers) > LARGEST] = np.nan
+        absent = np.isnan(numbers)
+        keep = np.flatnonzero(~absent.all(0))
+        without = [name for place, name in enumerate(names) if place not in keep]
+        if not len(keep):
+            raise ConfigurationError(
+                f"{source} is not allowed: its channel {names[0]!r} has no number up to {LARGEST:g}"
+            )
+        remarks += [f"column {name!r} has no numbers: left out" for name in without]
+        lost = int((table.notna().to_numpy() & absent)[:, keep].sum())
         remarks += [f"{lost} cells without a finite number up to 1e15: no reading"] if lost else []
-        for name in names:
-            if numbers[name].isna().all():
-                raise ConfigurationError(
-                    f"{source} is not allowed: its channel {name!r} has no number up to {LARGEST:g}"
-                )
-        values = _on_even_times(numbers, times, source, remarks)
-        return cls(values, tuple(channels), tuple(remarks))
+        channels = [replace(channels[place], unit=channels[place].unit or units[place])
+                    for place in keep]  # fmt: skip
+        own = pd.DataFrame(numbers[:, keep], columns=[channel.name for channel in channels])
+        values = reading.on_even_times(own, times, source, remarks)
+        return cls(_without_codes(values, codes, source, remarks), tuple(channels), tuple(remarks))
 
     @property
     def interval(self) -> pd.Timedelta:
@@ -170,20 +185,24 @@ class Recording:
     @property
     def gaps(self) -> tuple[int, pd.Timedelta]:
         """Number of gaps without any reading, and the time of the longest."""
-        runs = [length for value, length in _runs(self.values.isna().all(axis=1)) if value]
-        return len(runs), max(runs, default=0) * self.interval
+        silent = judging.run_lengths(self.values.isna().all(axis=1))
+        lengths = [length for value, length in silent if value]
+        return len(lengths), max(lengths, default=0) * self.interval
 
     @property
     def card(self) -> tuple[ChannelCard, ...]:
         """The data card: a row for every channel."""
         agreements = [self._agreement(place) for place in range(len(self.channels))]
-        return tuple(self._card(place, agreements) for place in range(len(self.channels)))
+        same = judging.copies(self.values)
+        return tuple(self._card(place, agreements, same) for place in range(len(self.channels)))
 
-    def select(self, names: Sequence[str] = ()) -> Recording:
+    def select(self, names: Sequence[str] = (), share: float = 1.0) -> Recording:
         """Return some channels, by default all without a fault, with no readings at their limits.
 
         Args:
             names: names of channels.
+            share: share of the rows, from the first, for a fit: a channel that is constant there
+                has a fault.
 
         Raises:
             ConfigurationError: a name is unknown, or every channel has a fault.
@@ -192,52 +211,89 @@ class Recording:
         for name in names:
             if name not in known:
                 raise refusal("channels", name, f"some of {', '.join(known)}")
-        rows = [row for row in self.card if (row.channel.name in names if names else not row.fault)]
-        if not rows:
-            faults = "; ".join(f"{row.channel.name}: {row.fault}" for row in self.card)
-            raise refusal("channels", None, f"channels without a fault ({faults})")
-        channels = tuple(row.channel for row in rows)
-        values = self.values[[channel.name for channel in channels]]
-        low, high = ([getattr(channel, end) for channel in channels] for end in ("low", "high"))
-        return Recording(values.where((values > low) & (values < high)), channels, self.remarks)
+        card = self.card
+        low, high = ([getattr(row.channel, end) for row in card] for end in ("low", "high"))
+        values = self.values.where((self.values > low) & (self.values < high))
+        different = values.iloc[: int(share * len(values))].nunique()
+        late = {name: "constant in the fitted part" for name in known if different[name] < 2}
+        faults = {row.channel.name: row.fault or late.get(row.channel.name, "") for row in card}
+        chosen = [name for name in known if (name in names if names else not faults[name])]
+        if not chosen:
+            text = "; ".join(f"{name}: {fault}" for name, fault in faults.items())
+            raise refusal("channels", None, f"channels without a fault ({text})")
+        remarks = [
+            f"{name}: {fault}{'' if name in chosen else ', left out'}"
+            for name, fault in faults.items()
+            if fault and (name in chosen or not names)
+        ]
+        for row in (row for row in card if row.channel.name in chosen):
+            counts = f"{row.spikes} spikes" * (row.spikes > 0)
+            stuck = f"{row.stuck:.1%} of the readings are stuck" * (row.stuck > 0.0)
+            remarks += [f"{row.channel.name}: {text}" for text in (counts, stuck) if text]
+        channels = tuple(row.channel for row in card if row.channel.name in chosen)
+        return Recording(values[chosen], channels, (*self.remarks, *remarks))
 
-    def _card(self, place: int, agreements: Sequence[float]) -> ChannelCard:
+    def hold(self) -> Recording:
+        """Return the recording with the last reading of a channel where the channel is silent.
+
+        In a log recorded on change, silence says that the quantity is within one change of the last
+        reading. The difference acts like measurement noise, with at most the change squared as
+        its variance.
+        """
+        held = self.values.ffill()
+        count = int((held.notna() & self.values.isna()).to_numpy().sum())
+        remark = f"{count} steps of silence have the last reading of their channel"
+        return replace(self, values=held, remarks=(*self.remarks, remark))
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a log that ``read`` reads without options.
+
+        Args:
+            path: the CSV file.
+        """
+        heads = []
+        for c in self.channels:
+            limits = f" {c.low:f}..{c.high:f}".replace("-inf", "").replace("inf", "")
+            heads.append(c.name + f" [{c.unit}]" * bool(c.unit) + limits * (limits != " .."))
+        self.values.set_axis(heads, axis=1).to_csv(path, index_label="time")
+
+    def _card(
+        self, place: int, agreements: Sequence[float], same: Mapping[str, str]
+    ) -> ChannelCard:
         column = self.values.iloc[:, place]
         readings = column.dropna()
         values = readings.to_numpy()
         distinct, counts = np.unique(values, return_counts=True)
         channel = _with_limits(self.channels[place], distinct, counts)
         saturated = (values <= channel.low) | (values >= channel.high)
-        free = [length for value, length in _runs(values) if channel.low < value < channel.high]
+        same_values = judging.run_lengths(values)
+        free = [length for value, length in same_values if channel.low < value < channel.high]
         long = max(_STUCK, 8.0 * float(np.mean(free or [1])))
         stuck = sum(length for length in free if length >= long) / max(len(values), 1)
         changes = np.diff(values)
-        usual = 1.4826 * float(np.median(np.abs(changes))) or float(changes.std())
-        jumps = np.minimum(np.abs(changes[1:]), np.abs(changes[:-1])) * (
-            changes[1:] * changes[:-1] < 0.0
-        )
-        agreement, fault = agreements[place], ""
-        others = [agreements[other] for other in self._peers(place)]
-        if len(distinct) == 1:
-            fault = "constant"
-        elif stuck > 0.5:
-            fault = "stuck"
-        elif agreement < _FAULTY and np.median(others) >= _AGREEMENT:
-            fault = "disagrees with its peers"
+        usual = 1.4826 * np.median(np.abs(changes)) or changes.std() if changes.size else 0.0
+        size = np.abs(changes)
+        jumps = np.minimum(size[1:], size[:-1]) * (changes[1:] * changes[:-1] < 0.0)
+        agreement, others = agreements[place], [agreements[peer] for peer in self._peers(place)]
+        faults = {
+            "constant": len(distinct) == 1,
+            "stuck": stuck > 0.5,
+            "counts": judging.counts_up(values),
+            "wraps around": judging.wraps(values),
+            same.get(channel.name, ""): channel.name in same,
+            "disagrees with its peers": agreement < _FAULTY and np.median(others) >= _AGREEMENT,
+        }
+        every = float(np.median(np.diff(np.flatnonzero(column.notna())))) if changes.size else 0.0
+        several = len(distinct) > 1
         return ChannelCard(
-            channel=channel,
-            readings=len(values),
-            missing=1.0 - len(values) / len(column),
-            every=float(np.median(np.diff(np.flatnonzero(column.notna())))) if changes.size else 0,
-            mean=float(values.mean()),
-            deviation=float(values.std()),
-            resolution=float(np.diff(distinct).min()) if len(distinct) > 1 else 0.0,
-            saturated=float(saturated.mean()) if len(distinct) > 1 else 0.0,
-            stuck=stuck,
-            spikes=int((jumps > _SPIKE * usual).sum()),
-            agreement=agreement,
-            fault=fault,
-        )
+            channel=channel, readings=len(values), missing=1.0 - len(values) / len(column),
+            every=every, mean=float(values.mean()), deviation=float(values.std()),
+            resolution=float(np.diff(distinct).min()) if several else 0.0,
+            saturated=float(saturated.mean()) if several else 0.0, stuck=stuck,
+            spikes=int((jumps > _SPIKE * usual).sum()), agreement=agreement,
+            fault=next((fault for fault, true in faults.items() if true), ""),
+            change=judging.reported_change(column.to_numpy()),
+        )  # fmt: skip
 
     def _peers(self, place: int) -> list[int]:
         unit = self.channels[place].unit
@@ -252,26 +308,6 @@ class Recording:
         return float(self.values.iloc[:, place].corr(self.values.iloc[:, peers].median(axis=1)))
 
 
-def _table(path: Path) -> pd.DataFrame:
-    """Return the cells of a CSV file, with the separator of its first line."""
-    try:
-        if path.exists() and not path.is_file():
-            raise ValueError("it is no regular file")
-        with get_handle(path, "rb", compression="infer", is_text=False) as handle:
-            raw = handle.handle.read(LONGEST_TEXT + 1)
-        text = raw.decode("utf-8-sig")
-        line = text.lstrip().partition("\n")[0]
-        separator = max(",;\t", key=line.count)
-        columns = len(next(csv.reader([line], delimiter=separator), []))
-        if len(raw) > LONGEST_TEXT or columns > 1 + LONGEST:
-            raise ValueError(f"above {LONGEST_TEXT:,} bytes or {LONGEST} channels")
-        return pd.read_csv(io.StringIO(text), sep=separator, skipinitialspace=True)
-    except Exception as error:  # a damaged archive may raise any exception
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split()[:20])
-        allowed = f"a CSV file ({reason or type(error).__name__})"
-        raise refusal("log", str(path), allowed) from None
-
-
 def _channel(head: str, source: str) -> RecordedChannel:
     match = _HEAD.fullmatch(" ".join(head.split()))
     low, high = (float(match[end] or size) if match else 0 for end, size in _ENDS.items())
@@ -283,54 +319,27 @@ def _channel(head: str, source: str) -> RecordedChannel:
     return RecordedChannel(match["name"], match["unit"] or "", low, high)
 
 
-def _times(cells: pd.Series, source: str, remarks: list[str]) -> pd.Series:
-    """Return the times of the rows, NaT where a cell has none; numbers are seconds."""
-    if pd.api.types.is_numeric_dtype(cells):
-        rises = (cells.diff().dropna() >= 0.0).mean() > 0.75  # else it is a channel
-        seconds = cells.where((cells.abs() < 9e9) & rises)  # the years of pandas
-        times = pd.to_datetime(seconds, unit="s", errors="coerce", utc=True)
-    else:
-        times = pd.to_datetime(cells, errors="coerce", utc=True, format="ISO8601")
-        if times.isna().mean() > 0.5:
-            times = pd.to_datetime(cells, errors="coerce", utc=True)
-    lost = int(times.isna().sum())
-    if lost > len(times) / 2 or len(times) - lost < _LEAST:
-        raise ConfigurationError(
-            f"{source} is not allowed: {len(times) - lost} of its {len(times)} rows begin with a "
-            f"time, and at least {_LEAST} and half of them must, as in '2026-01-31 12:30:00'"
-        )
-    remarks += [f"{lost} rows without a time: left out"] if lost else []
-    back = int((times.dropna().diff() < pd.Timedelta(0)).sum())
-    remarks += [f"{back} times before the row above: sorted"] if back else []
-    return times
-
-
-def _on_even_times(
-    numbers: pd.DataFrame, times: pd.Series, source: str, remarks: list[str]
+def _without_codes(
+    values: pd.DataFrame, codes: Sequence[float], source: str, remarks: list[str]
 ) -> pd.DataFrame:
-    """Return the first reading of each channel at each multiple of the most frequent interval."""
-    numbers = numbers[times.notna()].set_index(pd.DatetimeIndex(times.dropna()))
-    numbers = numbers.sort_index(kind="stable")
-    twice = int(numbers.index.duplicated().sum())
-    remarks += [f"{twice} rows at the time of another: the first reading counts"] if twice else []
-    apart = numbers.index.to_series().diff()
-    apart = apart[apart > pd.Timedelta(0)]
-    if apart.empty:
-        raise ConfigurationError(f"{source} is not allowed: all its rows have the same time")
-    interval = apart.mode().iloc[0]
-    places = np.asarray((numbers.index - numbers.index[0]) / interval)
-    steps = np.rint(places).astype(np.int64)
-    if steps[-1] >= min(_MOST, 200 * len(steps)):
-        raise ConfigurationError(
-            f"{source} is not allowed: from {numbers.index[0]} to {numbers.index[-1]} are "
-            f"{steps[-1]:,} intervals of {interval}, too many for its {len(steps):,} rows; look "
-            "for a wrong time"
-        )
-    off = int((np.abs(places - steps) > _OFF).sum())
-    remarks += [f"{off} times between the even ones: rounded"] if off else []
-    values = numbers.groupby(steps).first().reindex(np.arange(steps[-1] + 1))
-    first = numbers.index[0].tz_localize(None)
-    return values.set_axis(first + interval * values.index, axis=0)
+    """Return the readings that are no error code."""
+    result = values.copy()
+    for name in values:
+        readings = values[name].dropna().to_numpy()
+        counts = [(code, int((readings == code).sum())) for code in codes]
+        known = [pair for pair in counts if pair[1]]
+        known += judging.error_codes(readings[~np.isin(readings, codes)])
+        result[name] = values[name].where(~values[name].isin([code for code, _ in known]))
+        remarks += [f"{name}: {count} readings of {code:g} are an error code: no reading"
+                    for code, count in known]  # fmt: skip
+        if result[name].isna().all():
+            raise ConfigurationError(
+                f"{source} is not allowed: its channel {name!r} has error codes alone"
+            )
+    for code in codes:
+        if not (values == code).to_numpy().any():
+            remarks.append(f"no reading is the error code {code:g}")
+    return result
 
 
 def _with_limits(
@@ -344,8 +353,3 @@ def _with_limits(
     low = float(distinct[0]) if low == -np.inf and counts[0] >= often else low
     high = float(distinct[-1]) if high == np.inf and counts[-1] >= often else high
     return RecordedChannel(channel.name, channel.unit, low, high)
-
-
-def _runs(values: Any) -> list[tuple[Any, int]]:
-    """Return the values of runs of equal entries, and their lengths."""
-    return [(value, len(list(same))) for value, same in groupby(np.asarray(values).tolist())]

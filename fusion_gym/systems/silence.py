@@ -12,6 +12,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.options import plain_options
 from fusion_gym.errors import refusal
 from fusion_gym.gaussian import interval_moments
+from fusion_gym.linalg import TOLERANCE
 
 Trigger = Literal["innovation_threshold", "report_on_change", "send_on_delta"]
 # Parameter of each trigger that bounds a silent measurement.
@@ -33,9 +34,9 @@ class Silence:
         $$
 
         c is the last delivered value under ``send_on_delta`` and ``report_on_change``, and the
-        predicted measurement under ``innovation_threshold``. θ is ``trigger_threshold``, p the
-        probability that a request would have failed: 1 where the tokens would not have paid for
-        it, and else the probability of a loss.
+        predicted measurement under ``innovation_threshold``. θ is ``trigger_threshold``, for the
+        first two less a millionth, as in the rules. p is the probability that a request would have
+        failed: 1 where the tokens would not have paid for it, and else the probability of a loss.
 
     Assumes: the policy ``trigger`` with this threshold and without a min_interval.
 
@@ -94,7 +95,8 @@ class Silence:
             deviation: deviation of the prediction.
             failure: p.
         """
-        width = np.maximum(threshold, _LEAST)
+        narrow = 0.0 if self.trigger == "innovation_threshold" else TOLERANCE
+        width = np.maximum((1.0 - narrow) * threshold, _LEAST)
         low, high = (shift - width) / deviation, (shift + width) / deviation
         inside = interval_moments(low, np.maximum(high, np.nextafter(low, np.inf)))
         likely = (1.0 - failure) * np.where(threshold > 0.0, inside.probability, 0.0)

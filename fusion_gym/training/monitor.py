@@ -17,16 +17,9 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.progress import Bar
-from fusion_gym.training import checkpoint
+from fusion_gym.training import checkpoint, diagnosis
 from fusion_gym.training.checkpoint import Journal, ValidationRecord
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.diagnosis import (
-    Callback,
-    PriceRecord,
-    run_at_prices,
-    threshold_costs,
-    validation_prices,
-)
 
 
 class Interrupt:
@@ -57,7 +50,7 @@ class Stop(Exception):
     """Ends a training between two rollouts, where the model has learned from all counted steps."""
 
 
-class Progress(Callback):
+class Progress(diagnosis.Callback):
     """Validates, saves the best model and checkpoints, and shows progress and wall time."""
 
     def __init__(
@@ -140,10 +133,10 @@ class Progress(Callback):
         The best has the least mean over the prices of its cost relative to a single threshold's.
         """
         settings, local = self.experiment.validation, self.experiment.environment.local
-        rows = run_at_prices(
+        rows = diagnosis.run_at_prices(
             self.model, self.task, local, self.prices, settings.episodes, settings.seed
         )
-        means = PriceRecord(*np.mean(rows, axis=0).tolist())
+        means = diagnosis.PriceRecord(*np.mean(rows, axis=0).tolist())
         costs = np.array([row.cost for row in rows])
         scale = self.task.reward.price.scale(
             np.array(self.prices), self.experiment.training.price_exponent
@@ -176,9 +169,9 @@ class Progress(Callback):
         self.bar.say(log_line(record))
 
     @property
-    def last(self) -> list[PriceRecord]:
+    def last(self) -> list[diagnosis.PriceRecord]:
         """The last validation."""
-        return [PriceRecord(**row) for row in self.journal.records[-1]["prices"]]
+        return [diagnosis.PriceRecord(**row) for row in self.journal.records[-1]["prices"]]
 
     def _write_best(self, content: bytes) -> None:
         with replacing(self.folder / "best_model.zip") as partial:
@@ -191,12 +184,12 @@ class Progress(Callback):
     @functools.cached_property
     def prices(self) -> tuple[float, ...]:
         """The prices of a token in validations."""
-        return validation_prices(self.task)
+        return diagnosis.validation_prices(self.task)
 
     @functools.cached_property
     def references(self) -> Array:
         """The cost of the best single threshold at each price."""
-        return threshold_costs(self.task, self.experiment.environment.local, self.prices)
+        return diagnosis.threshold_costs(self.task, self.experiment.environment.local, self.prices)
 
     def save(self) -> None:
         """Write the checkpoint."""

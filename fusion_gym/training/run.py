@@ -24,15 +24,7 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SensorView
 from fusion_gym.errors import forbidden
 from fusion_gym.importing import trust_files
-from fusion_gym.output.files import (
-    check_inputs,
-    fingerprint,
-    folder_refusal,
-    lock_folder,
-    replacing,
-    write,
-    write_text,
-)
+from fusion_gym.output import files
 from fusion_gym.output.progress import progress_bar, quietly, remark, writing
 from fusion_gym.policies.loading import load_model_policy
 from fusion_gym.policies.model import tag_model
@@ -161,11 +153,11 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
     where, checkpoint = f"the training in {str(folder)!r}", folder / "latest.zip"
     if not resume:
         if holds_training(folder):
-            raise folder_refusal(folder, "a training")
+            raise files.folder_refusal(folder, "a training")
         return None
     if checkpoint.exists():
         journal = read_journal(checkpoint)
-        check_inputs(experiment.inputs(), journal.inputs, where)
+        files.check_inputs(experiment.inputs(), journal.inputs, where)
         return journal
     if (folder / "final_model.zip").exists():
         raise ConfigurationError(
@@ -174,7 +166,7 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
         )
     with trust_files():  # a checkpoint there would contain code, too
         begun = load_checked(Experiment, folder / "config.yaml")
-    check_inputs(experiment.inputs(), begun.inputs(), where)
+    files.check_inputs(experiment.inputs(), begun.inputs(), where)
     return None
 
 
@@ -228,7 +220,7 @@ def train(
     experiment = experiment.resolved(env.task.settings, env.task.sensors)
     earlier(experiment, folder, resume)  # refuses before it creates a folder
     torch.set_num_threads(experiment.training.threads)
-    with lock_folder(folder, "output"):
+    with files.lock_folder(folder, "output"):
         journal = earlier(experiment, folder, resume)
         if journal is None:
             journal = Journal(experiment.inputs())
@@ -238,7 +230,7 @@ def train(
         if not quiet:
             writing(("checkpoints, models and validations", folder))
         plain = experiment.model_dump(mode="json")
-        write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
+        files.write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
         return _learn(experiment, folder, model, scored, journal, quiet, callbacks)
 
 
@@ -277,7 +269,7 @@ def _learn(
                 warn_of_silence(progress.last)
         progress.save()
         if finished:
-            with replacing(folder / "final_model.zip") as partial:
+            with files.replacing(folder / "final_model.zip") as partial:
                 model.save(partial)
             if experiment.calibration and len(progress.prices) > 1 and journal.best:
                 bar.say("calibrating")
@@ -290,9 +282,9 @@ def _learn(
         "steps_per_second": round(model.num_timesteps / (sum(journal.seconds.values()) or 1.0)),
         "seconds": {key: round(value, 2) for key, value in journal.seconds.items()},
         "best_validation": best and {key: value for key, value in best.items() if key != "prices"},
-        "inputs": fingerprint(journal.inputs),
+        "inputs": files.fingerprint(journal.inputs),
     }
-    write(folder / "summary.json", summary)
+    files.write(folder / "summary.json", summary)
     if not quiet:
         print(describe(summary, folder, time.perf_counter() - began))
     return summary

@@ -311,6 +311,9 @@ class DynamicEvent(LocalRule):
 class SendOnDelta(LocalRule):
     r"""Request when the measurement differs from the last delivered one by ``threshold`` or more.
 
+    A difference of ``threshold`` counts up to a millionth, so rounding does not decide. Equal
+    measurements never request.
+
     Args:
         threshold: θ >= 0, in the unit of the measurement.
         min_interval: least steps between two deliveries of a sensor, >= 1.
@@ -318,7 +321,7 @@ class SendOnDelta(LocalRule):
 
     Equation:
         $$
-        \delta_i(t)=1\iff \lVert y_i(t)-\bar y_i\rVert\ge\theta_i
+        \delta_i(t)=1\iff \lVert y_i(t)-\bar y_i\rVert\ge\theta_i\ \text{and}\ y_i(t)\ne\bar y_i
         $$
 
         ȳᵢ is the last delivered measurement of sensor i, θ is ``threshold``.
@@ -340,12 +343,15 @@ class SendOnDelta(LocalRule):
         """Return the requests (sensors, N)."""
         moved = signals["measurement"] - signals["held"]
         threshold = self.column("threshold", shape_of(signals)[0])
-        return self.limit(linalg.dot(moved, moved) >= threshold * threshold, signals)
+        return self.limit(linalg.reaches(linalg.dot(moved, moved) ** 0.5, threshold), signals)
 
 
 @dataclass
 class ReportOnChange(LocalRule):
     r"""Request when a channel differs from its last delivered value by ``reportable_change``.
+
+    A difference of ``reportable_change`` counts up to a millionth, so rounding does not decide.
+    Equal values are never reported before ``max_interval``.
 
     Args:
         reportable_change: Δ >= 0, in the unit of the measurement, or in percent.
@@ -383,7 +389,7 @@ class ReportOnChange(LocalRule):
         change = self.column("reportable_change", len(measurement))[:, None]
         if self.percent:
             change = change / 100.0 * xp.abs(held)
-        return self.limit((xp.abs(measurement - held) >= change).any(1), signals)
+        return self.limit(linalg.reaches(xp.abs(measurement - held), change).any(1), signals)
 
 
 @dataclass

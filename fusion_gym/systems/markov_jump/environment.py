@@ -118,23 +118,15 @@ class MarkovJumpTrackingOptions(PaperOptions):
 def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
     """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
+    chain = options.mode_transition, options.initial_probabilities
+    start = options.initial_mean, options.initial_covariance
     dynamics = MarkovJumpPlant.create(
-        options.transitions,
-        options.process_gains,
-        options.process_covariance,
-        options.mode_transition,
-        options.initial_probabilities,
-        options.initial_mean,
-        options.initial_covariance,
+        options.transitions, options.process_gains, options.process_covariance, *chain, *start
     )
+    fading = options.fading_values, options.fading_probabilities
+    noise = options.noise_coupling, options.measurement_variance
     sensors = FadingSensors.create(
-        options.measurement_matrices,
-        options.sampling_periods,
-        options.fading_values,
-        options.fading_probabilities,
-        options.noise_coupling,
-        options.measurement_variance,
-        dynamics,
+        options.measurement_matrices, options.sampling_periods, *fading, *noise, dynamics
     )
     weights = options.own_weights(dynamics.size)
     nature = Nature.create(options, (*dynamics.unmoved, "true_threshold_shift"))

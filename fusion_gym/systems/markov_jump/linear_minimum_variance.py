@@ -32,12 +32,11 @@ ROUNDING = 1e-14  # relative, of a sum over modes
 class AugmentedStep(NamedTuple):
     """The augmented model at one time k, without a batch axis; a = modes · n.
 
-    ``probabilities`` π(k) (modes,) · ``moment`` P(k) (a, a), block diagonal, the second moment of
-    ζ(k) · ``mean`` of ζ(k) (a,) · ``input`` B̄(k) (a, r) · ``additional`` Q_c(k) (a, a), the
-    covariance that the hidden mode adds between k and k + 1.
+    ``moment`` P(k) (a, a), block diagonal, the second moment of ζ(k) · ``mean`` of ζ(k) (a,) ·
+    ``input`` B̄(k) (a, r) · ``additional`` Q_c(k) (a, a), the covariance that the hidden mode adds
+    between k and k + 1.
     """
 
-    probabilities: Array
     moment: Array
     mean: Array
     input: Array
@@ -112,7 +111,7 @@ class AugmentedModel:
             entry = entry.reshape(self.size, -1)
             later = _diagonal_blocks(following)
             carried = self.transition @ now @ self.transition.T + entry @ noise @ entry.T
-            yield AugmentedStep(pi, now, mean, entry, later - carried)
+            yield AugmentedStep(now, mean, entry, later - carried)
             moments, now, pi, mean = following, later, pi @ chain, self.transition @ mean
 
     def state_moments(self, last: int) -> tuple[Array, Array]:
@@ -235,7 +234,7 @@ class LocalFilters:
         joint[:] = first.moment - np.outer(first.mean, first.mean)
         shared = sensors.noise_coupling[..., 0] @ plant.noise_covariance
         noise = shared @ sensors.noise_coupling[..., 0].T
-        rows: list[_Row] = []
+        rows: list[dict[str, Array]] = []
         observed: list[tuple[Array, ...]] = []
         for time, step in enumerate(model.steps()):
             row, following = _advance(model, step, joint, shared, noise, time)
@@ -246,8 +245,8 @@ class LocalFilters:
                 break
             joint = following
         tables = {
-            name: np.ascontiguousarray(np.moveaxis(np.array(entries), 0, -1))
-            for name, entries in zip(_Row._fields, zip(*rows, strict=True), strict=True)
+            name: np.ascontiguousarray(np.stack([row[name] for row in rows], axis=-1))
+            for name in rows[0]
         }
         return cls(
             transition=model.transition[..., None],
@@ -290,19 +289,6 @@ class LocalFilters:
         return mean + correction, noise_mean, innovation
 
 
-class _Row(NamedTuple):
-    """One time's entries of the tables of :class:`LocalFilters`, without the time axis."""
-
-    input: Array
-    gain: Array
-    noise_gain: Array
-    innovation_covariance: Array
-    step: Array
-    covariance: Array
-    filtered_cross: Array
-    predicted_cross: Array
-
-
 def settled(now: tuple[Array, ...], before: tuple[Array, ...]) -> bool:
     """Return whether second moments (a, a) or (l, a, l, a) agree to 1e-13 of their deviations."""
     for a, b in zip(now, before, strict=True):
@@ -316,7 +302,7 @@ def settled(now: tuple[Array, ...], before: tuple[Array, ...]) -> bool:
 
 def _advance(
     model: AugmentedModel, step: AugmentedStep, joint: Array, shared: Array, noise: Array, time: int
-) -> tuple[_Row, Array]:
+) -> tuple[dict[str, Array], Array]:
     """Return one time's row of the tables, and the next joint prediction covariance."""
     sensors, transition, faded = model.sensors, model.transition, model.faded
     own = sensors.fading_variance * np.einsum(
@@ -342,16 +328,11 @@ def _advance(
     filtered_cross = np.einsum("jab,jib->ija", factor, observed) - noise[..., None] * gain
     predicted_cross = np.einsum("jab,jib->ija", moved, observed) + entering[:, None]
     predicted_cross -= noise[..., None] * stride
-    row = _Row(
-        input=step.input,
-        gain=gain,
-        noise_gain=noise_gain,
-        innovation_covariance=innovation,
-        step=stride,
-        covariance=_symmetric(covariance),
-        filtered_cross=filtered_cross,
-        predicted_cross=predicted_cross,
-    )
+    row = {
+        "input": step.input, "gain": gain, "noise_gain": noise_gain, "step": stride,
+        "innovation_covariance": innovation, "covariance": _symmetric(covariance),
+        "filtered_cross": filtered_cross, "predicted_cross": predicted_cross,
+    }  # fmt: skip
     return row, _symmetric(following)
 
 

@@ -21,13 +21,8 @@ from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
 from fusion_gym.errors import forbidden
 from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.remote import vector
 from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
-from fusion_gym.systems.remote.vector import (
-    VectorEstimator,
-    VectorSources,
-    make_sources,
-    vector_scale,
-)
 from fusion_gym.systems.silence import Silence, Trigger
 
 _FILTERS: dict[str, type] = {"symmetric": RemoteEstimator, "truncated": Silence}
@@ -141,14 +136,14 @@ def _build_vector(options: RemoteEstimationOptions) -> Scenario:
         if getattr(options, name) != getattr(RemoteEstimationOptions, name):
             reason = "it belongs to scalar sources"
             raise forbidden(name, getattr(options, name), reason, "with sources")
-    model = VectorSources.create(
-        make_sources(options.sources), options, validation.horizon(options.horizon)
+    model = vector.VectorSources.create(
+        vector.make_sources(options.sources), options, validation.horizon(options.horizon)
     )
     size, sensors = len(model.state_names), model.sensor_count
     chosen = options.own_weights(size)
     weights = np.ones(size) if chosen is None else chosen
     steps = max(_SILENCE, round(float(_steps(options, sensors).max())))
-    estimator = VectorEstimator(model, vector_scale(model, steps), weights)
+    estimator = vector.VectorEstimator(model, vector.vector_scale(model, steps), weights)
     return Scenario(
         options,
         model,

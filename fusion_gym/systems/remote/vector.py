@@ -178,11 +178,9 @@ class VectorSources(NormalPlant):
         """Move the sources, and measure."""
         count, channels, size, _ = self.measurement_matrix.shape
         split, runs = count * size, noise.shape[-1]
-        process, own = true_noise(
-            state.departure,
-            noise[:split].reshape(count, size, runs),
-            noise[split:].reshape(count, channels, runs),
-        )
+        moving = noise[:split].reshape(count, size, runs)
+        measured = noise[split:].reshape(count, channels, runs)
+        process, own = true_noise(state.departure, moving, measured)
         before = self.blocks(state.truth)
         moved = true_motion(state.departure, before, linalg.matvec(self.transition, before))
         truth = moved + linalg.matvec(self.process_factor, process)

@@ -196,11 +196,6 @@ def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPla
     inner = validation.array("bias_transition", options.bias_transition, (biases, biases))
     mean = validation.array("initial_mean", options.initial_mean, (states,))
     bias_mean = validation.array("bias_initial_mean", options.bias_initial_mean, (biases,))
+    mean, start = np.concatenate([mean, bias_mean]), block_diag(start, bias_start)
     joint = np.block([[transition, gain if aware else 0.0 * gain], [np.zeros_like(gain.T), inner]])
-    plant = LinearPlant.create(
-        joint,
-        block_diag(process, noise),
-        np.concatenate([mean, bias_mean]),
-        block_diag(start, bias_start),
-    )
-    return plant, states
+    return LinearPlant.create(joint, block_diag(process, noise), mean, start), states

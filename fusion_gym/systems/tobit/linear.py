@@ -116,7 +116,7 @@ def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
     for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
         full = name if single else f"{name}[{place}]"
         if _dimensions(value) == 0:
-            value = validation.number(full, value, above=0.0) * np.eye(size)
+            value = validation.number(full, value, at_least=validation.SMALLEST**2) * np.eye(size)
         result.append(validation.covariance(full, value, size, definite=True))
     return result
 
@@ -250,16 +250,9 @@ class LinearFusionOptions(FeedbackOptions):
 
     def nominal(self) -> LinearFusionOptions:
         """Return the options whose simulation scales the reward, equal for all filters."""
-        return replace(
-            super().nominal(),
-            filter=None,
-            fusion=None,
-            information_shares=None,
-            order=None,
-            stochastic_weight=None,
-            trigger=None,
-            trigger_threshold=None,
-        )
+        own = ("filter", "fusion", "information_shares", "order", "stochastic_weight", "trigger")
+        left_out: dict[str, Any] = dict.fromkeys((*own, "trigger_threshold"))
+        return replace(super().nominal(), **left_out)
 
 
 def build_linear(choice: LinearFusionOptions) -> Scenario:

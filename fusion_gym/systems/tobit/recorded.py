@@ -172,7 +172,11 @@ class ResampledNoise(PhiloxNoise):
 
 
 class _Part(NamedTuple):
-    """The channels of a log: deviations (T, l), fitted rows, level (l, 5), and times in days."""
+    """The channels of a log.
+
+    Deviations (T, l), fitted rows, level (l, 5), times and step in days, and a millionth of the
+    resolutions (l,).
+    """
 
     names: tuple[str, ...]
     values: Array
@@ -180,6 +184,7 @@ class _Part(NamedTuple):
     level: Array
     day: Array
     step: float
+    quantum: Array
 
 
 @functools.lru_cache(maxsize=4)
@@ -196,7 +201,9 @@ def _part(log: str, modified: float, names: tuple[str, ...] | None, share: float
     values, rows, level = levels(recording, share)
     index, day = recording.values.index, 86_400.0
     times = np.asarray((index - index.normalize()).total_seconds()) / day
-    return _Part(names, values, rows, level, times, recording.interval.total_seconds() / day)
+    quantum = np.array([1e-6 * (row.resolution or 1.0) for row in recording.card])
+    step = recording.interval.total_seconds() / day
+    return _Part(names, values, rows, level, times, step, quantum)
 
 
 def build_recorded(choice: RecordedFusionOptions) -> Scenario:
@@ -239,7 +246,7 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     }[choice.source]()
     recorded = RecordedPlant(**{item.name: getattr(truth, item.name) for item in fields(truth)})
 
-    level = DailyLevel(part.level, part.step)
+    level = DailyLevel(part.level, part.step, part.quantum[:, None, None])
     filters: Any = scenario.estimator
     return replace(
         scenario,

@@ -125,17 +125,23 @@ class DailyLevel:
     """What readings have beside the plant's deviations.
 
     ``waves`` (l, 5) has each sensor's constant, sine and cosine of one and of two periods a day;
-    ``step`` is a step in days.
+    ``step`` is a step in days. Readings are multiples of ``quantum`` (l, 1, 1).
     """
 
     waves: Array
     step: float
+    quantum: Array
 
     def at(self, day: Array, time: Array) -> Array:
         """Return the level (l, 1, N) after steps ``time`` (N,) from the times of day (N,)."""
         turn = 2.0 * np.pi * (day + self.step * time)
         waves = [np.ones_like(turn), np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn)]
         return (self.waves @ np.array(waves))[:, None]
+
+    def reading(self, deviation: Array, level: Array) -> Array:
+        """Return the reading (l, 1, N) without rounding errors, which would count as changes."""
+        result: Array = np.round((deviation + level) / self.quantum) * self.quantum
+        return result
 
 
 @dataclass(slots=True)
@@ -384,10 +390,11 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         if self.level is None:
             return values
         level, available = self._level(state, state.time), cast(Any, state.available)
-        moved = ("measurement", "held", "expected_measurement")
         return {
             **values,
-            **{name: np.asarray(values[name]) + level for name in moved},
+            "measurement": self.level.reading(state.measurement, level),
+            "held": self.level.reading(state.held, level),
+            "expected_measurement": expectation.value + level,
             "sampled": available,
             "variance_reduction": lambda: np.where(available, variances()[1], 0.0),
         }

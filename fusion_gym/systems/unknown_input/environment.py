@@ -23,22 +23,9 @@ from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.errors import forbidden
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.parts import numbered_states
-from fusion_gym.systems.unknown_input.filters import (
-    BoundTables,
-    ExactInputStateFilter,
-    InputModel,
-    JointGain,
-    RandomWalkInputFilter,
-)
+from fusion_gym.systems.unknown_input import filters, signals
 from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
 from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
-from fusion_gym.systems.unknown_input.signals import (
-    ArrayInput,
-    InputSignal,
-    MeanRevertingWalk,
-    Sinusoids,
-    Steps,
-)
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 from fusion_gym.validation import ConfigurationError
 
@@ -133,9 +120,9 @@ Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
 FILTERS: dict[str, type] = {
-    "random_walk": RandomWalkInputFilter,
-    "predict": ExactInputStateFilter,
-    "paper": BoundTables,
+    "random_walk": filters.RandomWalkInputFilter,
+    "predict": filters.ExactInputStateFilter,
+    "paper": filters.BoundTables,
 }
 
 
@@ -236,15 +223,9 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
     """Return the scenario of these options."""
     options = _with_example(choice)
     horizon = validation.horizon(options.horizon)
-    plant = UnknownInputPlant.create(
-        options.transition,
-        options.input_matrix,
-        options.process_covariance,
-        options.sampling_period,
-        options.initial_mean,
-        options.initial_covariance,
-        options.initial_half_width,
-    )
+    motion = options.transition, options.input_matrix, options.process_covariance
+    start = options.initial_mean, options.initial_covariance, options.initial_half_width
+    plant = UnknownInputPlant.create(*motion, options.sampling_period, *start)
     signal = _signal(options, plant.inputs, horizon)
     sensors = InputSensors.create(
         options.measurement_matrices, options.measurement_covariance, plant
@@ -304,32 +285,32 @@ def _with_example(options: UnknownInputOptions) -> Any:
     return replace(options, **missing)
 
 
-def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
+def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> signals.InputSignal:
     kind = options.input_signal
     shape = {name: getattr(options, name) for name in _SHAPE}
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
                 raise validation.refusal(name, value, "None", "with an array as input_signal")
-        return ArrayInput.create(inputs, kind, horizon)
+        return signals.ArrayInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
     if kind == "sinusoids":
-        return Sinusoids.create(inputs, amplitude, period, phase)
+        return signals.Sinusoids.create(inputs, amplitude, period, phase)
     if not (isinstance(phase, str) and phase == "random"):
         reason = "phases belong to 'sinusoids'"
         raise forbidden("input_phase", phase, reason, f"with input_signal={kind!r}")
     if kind == "steps":
-        return Steps.create(inputs, amplitude, period)
-    return MeanRevertingWalk.create(inputs, amplitude, period)
+        return signals.Steps.create(inputs, amplitude, period)
+    return signals.MeanRevertingWalk.create(inputs, amplitude, period)
 
 
 def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:
     kind = validation.choice("filter", options.filter, FILTERS)
     factor = validation.positive("young_factor", options.young_factor, (sensors.count,))
-    model = InputModel.create(
+    model = filters.InputModel.create(
         plant, options.input_memory, options.input_change, options.input_deviation
     )
-    joint = JointGain.create(plant, sensors)
+    joint = filters.JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
     weights = options.own_weights(plant.size + plant.inputs)
     fusion = NodeFusion(rule, plant.size, options.fusion == "ci", weights)
@@ -339,10 +320,10 @@ def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizo
         raise forbidden("hold_variance", hold, reason, f"with filter={kind!r}")
     if kind == "paper":
         bound = options.rho_bar
-        tables = BoundTables.create(joint, model, bound, factor, horizon)
+        tables = filters.BoundTables.create(joint, model, bound, factor, horizon)
         return TableNodes.create(model, sensors, tables, fusion)
     if kind == "predict":
-        exact = ExactInputStateFilter(model, joint)
+        exact = filters.ExactInputStateFilter(model, joint)
         for sensor in np.flatnonzero(~(exact.growth(horizon) <= LARGEST_ERROR)):
             raise ConfigurationError(
                 f"horizon = {horizon} is not allowed with filter='predict' and sensor {sensor}: "
@@ -353,7 +334,7 @@ def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizo
     if hold is not None:
         hold = validation.not_negative("hold_variance", hold, (sensors.count,))
         hold = hold[:, None, None, None]
-    return RunNodes(model, sensors, RandomWalkInputFilter(model, sensors), fusion, hold)
+    return RunNodes(model, sensors, filters.RandomWalkInputFilter(model, sensors), fusion, hold)
 
 
 def _trigger(options: Any, sensors: int) -> dict[str, tuple[float, ...]]:

@@ -1,0 +1,358 @@
+"""The cells of a log's CSV file, and their times, numbers and even steps."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from pandas.io.common import get_handle
+
+from fusion_gym.arrays import Array
+from fusion_gym.errors import ConfigurationError, display, refusal
+from fusion_gym.validation import LONGEST, LONGEST_TEXT
+
+_LEAST, _MOST = 20, 5_000_000  # rows of a log, and steps from its first to its last time
+_OFF = 0.05  # of an interval: a time that is farther from the even times is counted
+_PHASE = 1e-3  # of an interval: a channel that reads later than the first by more is named
+_FIRST, _LAST = 1678, 2261  # years that nanoseconds reach
+_SAMPLE = 200  # lines or rows that show the layout of a file
+_ROUND = 3600.0, 60.0, 10.0, 1.0, 0.1, 0.01, 1e-3, 1e-6, 1e-9  # seconds of round intervals
+
+TIME_UNITS = {  # and their words in heads
+    "excel": "excel.*", "s": "s|secs?|seconds?", "ms": "ms|milliseconds?",
+    "us": "us|µs|μs|microseconds?", "ns": "ns|nanoseconds?", "min": "mins?|minutes?",
+    "h": "h|hrs?|hours?", "d": "d|days?",
+}  # fmt: skip
+_CLOCK_HEAD = re.compile("time|date|unix|epoch|stamp", re.IGNORECASE)
+_DATE = r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})"
+_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?(?:\s*[AaPp]\.?[Mm]\.?)?"
+_ORDERS = {"year first": (0, 1, 2), "day first": (2, 1, 0), "month first": (2, 0, 1)}
+_TWELVE = "%Y-%m-%d %I:%M:%S %p", "%Y-%m-%d %I:%M %p"
+_NAMES = re.compile(
+    "entity_id|_field|name|(sensor|channel|device|variable|parameter|metric|tag|topic|series|"
+    "signal|quantity|point)([ _]?(id|name))?",
+    re.IGNORECASE,
+)
+_VALUES = re.compile("_?value|state|reading|measurement", re.IGNORECASE)
+_CELL = r"([+-]?[\d., ]*\d\.?(?:[eE][+-]?\d+)?)\s*([^\d\s.,+'-]\D{0,9}\d?)?"
+_SPREAD = 3.0  # ratio of the relative deviations of two ways to read a column's numbers
+
+
+def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
+    """Return the cells of a CSV file as texts under its heads."""
+    try:
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no regular file")
+        with get_handle(path, "rb", compression="infer", is_text=False) as handle:
+            raw = handle.handle.read(LONGEST_TEXT + 1)
+        try:
+            text = raw.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = raw.decode("cp1252")
+        text = re.sub(r"(?m)^#.*\n(?=\D)", "", text)
+        width, separator, above = _layout(text)
+        if len(raw) > LONGEST_TEXT or width > 1 + LONGEST or "\0" in text:
+            most = f"above {LONGEST_TEXT:,} bytes or {LONGEST} channels, or binary"
+            raise ValueError(f"{width} columns: {most}")
+        cells = pd.read_csv(
+            io.StringIO(text), sep=separator, header=None, dtype=str, skiprows=above,
+            skipinitialspace=True,
+        ).apply(lambda column: column.str.strip())  # fmt: skip
+        heads = cells.iloc[0].fillna("").str.lstrip("# ")
+        numeric = heads.str.fullmatch(r"[\d\s.,:/TZ+-]+")
+        if above and numeric.any():
+            raise ValueError("its rows have more cells than heads: quote decimal commas")
+        if numeric.all():
+            raise ValueError(f"its heads are numbers, such as {display(heads.iloc[-1])}")
+    except Exception as error:  # a damaged archive may raise any exception
+        text = getattr(error, "strerror", None) or " ".join(str(error).split()[:20])
+        text = text or type(error).__name__
+        text += "; quote decimal commas" if isinstance(error, pd.errors.ParserError) else ""
+        raise refusal("log", str(path), f"a CSV file ({text})") from None
+    if text.lstrip('"').startswith("TOA5") and len(cells) > 2:  # units and aggregations
+        units = cells.iloc[1].fillna("")
+        heads = heads.where(units.isin(("", "TS", "RN")), heads + " [" + units + "]")
+        cells = cells.iloc[2:]
+    remarks += [f"{above} lines above the heads: left out"] if above else []
+    return cells.iloc[1:].set_axis(list(heads), axis=1).reset_index(drop=True)
+
+
+def _layout(text: str) -> tuple[int, str, int]:
+    """Return the number of columns, the separator, and the number of lines above the heads."""
+    lines, choices = text.split("\n", _SAMPLE)[:_SAMPLE], []
+    for separator in ",;\t":
+        widths = [len(row) for row in csv.reader(lines, delimiter=separator, skipinitialspace=True)]
+        width = max(widths, key=widths.count)
+        above = 1 if text.lstrip('"').startswith("TOA5") else widths.index(width)
+        choices.append((widths.count(width) * (width > 1), width, separator, above))
+    return max(choices)[1:]
+
+
+def split_times(
+    table: pd.DataFrame, source: str, date_format: str | None, time_unit: str | None,
+    remarks: list[str],
+) -> tuple[pd.Series, pd.DataFrame]:  # fmt: skip
+    """Return the times of the rows, NaT where a row has none, and the other columns."""
+    columns = [table.iloc[:, place] for place in range(table.shape[1])]
+    samples = [column.dropna().head(_SAMPLE) for column in columns]
+    dates, clocks = (
+        [place for place, own in enumerate(samples) if len(own) and own.str.fullmatch(form).all()]
+        for form in (_DATE, _CLOCK)
+    )
+    if dates and clocks:
+        cells, used = columns[dates[0]] + " " + columns[clocks[0]], {dates[0], clocks[0]}
+    else:
+        readings = [_times(own, date_format, time_unit) for own in samples]
+        shares = [max((t.notna().mean() for t in own.values()), default=0.0) for own in readings]
+        counts = [c.nunique() * (share > 0.5) for c, share in zip(columns, shares, strict=True)]
+        likely = (place for place, count in enumerate(counts) if count > max(counts) / 2)
+        place = min(likely, key=lambda n: _is_numeric(samples[n]), default=0)
+        cells, used = columns[place], {place}
+    times = _parse(cells, source, date_format, time_unit, remarks)
+    blank = {place for place, head in enumerate(table.columns) if head == ""} - used
+    if table.iloc[:, list(blank)].notna().to_numpy().any():
+        remarks.append("a column without a head: left out")
+    return times, table.iloc[:, [n for n in range(len(columns)) if n not in used | blank]]
+
+
+def _is_numeric(cells: pd.Series) -> bool:
+    return bool(pd.to_numeric(cells, errors="coerce").notna().mean() > 0.5)
+
+
+def _parse(
+    cells: pd.Series, source: str, date_format: str | None, time_unit: str | None,
+    remarks: list[str],
+) -> pd.Series:  # fmt: skip
+    """Return the times of the cells, NaT where a cell has none."""
+    choices = _times(cells, date_format, time_unit)
+    if time_unit is not None and not _is_numeric(cells):
+        raise refusal("time_unit", time_unit, "left out: the times of this log are no numbers")
+    scores = {order: _evenness(times) for order, times in choices.items()}
+    order = max(scores, key=scores.__getitem__, default="")
+    times = choices.pop(order, pd.Series(pd.NaT, cells.index))
+    for other, values in choices.items():
+        if scores[other] == scores[order] and not values.equals(times):
+            raise ConfigurationError(
+                f"{source} is not allowed: its dates, such as {cells.dropna().iloc[0]!r}, may be "
+                f"{order} or {other}; give date_format (--date-format), such as '%d/%m/%Y %H:%M'"
+            )
+    if choices and order != "year first":
+        remarks.append(f"dates such as {cells.dropna().iloc[0]!r} are read {order}")
+    lost = int(times.isna().sum())
+    if lost > len(times) / 2 or len(times) - lost < _LEAST:
+        for name, value in (("date_format", date_format), ("time_unit", time_unit)):
+            if value is not None:
+                raise refusal(name, value, f"for times such as {cells.dropna().iloc[:1].tolist()}")
+        raise ConfigurationError(
+            f"{source} is not allowed: {len(times) - lost} of its {len(times)} rows begin with a "
+            f"time, and at least {_LEAST} and half of them must; other dates need --date-format, "
+            "and numbers a unit in the head, as in 'elapsed [min]', or --time-unit"
+        )
+    remarks += [f"{lost} rows without a time: left out"] if lost else []
+    back = int((times.dropna().diff() < pd.Timedelta(0)).sum())
+    remarks += [f"{back} times before the row above: sorted"] if back else []
+    return times.dt.tz_localize(None)
+
+
+def _times(
+    cells: pd.Series, date_format: str | None, time_unit: str | None
+) -> dict[str, pd.Series]:
+    """Return the times for each order of year, month and day that some cells allow."""
+    if date_format is not None:
+        try:
+            return {"": pd.to_datetime(cells, format=date_format, errors="coerce", utc=True)}
+        except (TypeError, ValueError) as error:
+            raise refusal("date_format", date_format, f"a format of strftime ({error})") from None
+    if _is_numeric(cells):
+        numbers = pd.to_numeric(cells, errors="coerce")
+        changes = numbers.diff().dropna()
+        ordered = max((changes >= 0.0).mean(), (changes <= 0.0).mean()) > 0.75
+        unit = (time_unit or _head_unit(str(cells.name), numbers)) if ordered else None
+        if unit is None:
+            return {}
+        size = numbers * pd.Timedelta(1, "D" if unit in ("d", "excel") else unit).value
+        size += pd.Timestamp("1899-12-30").value if unit == "excel" else 0
+        size = size.where(size.abs() < 9e18).round(0 if unit == "ns" else -3)
+        return {"": pd.to_datetime(size, unit="ns", errors="coerce")}
+    plain = cells.str.upper().str.replace(r"(?<=\d),(?=\d)", ".", regex=True)
+    plain = plain.str.replace(r"\s*([AP])\.?M\.?$", r" \1M", regex=True)
+    parts = plain.str.replace(r"\s*UTC$", "Z", regex=True).str.extract(
+        rf"^{_DATE}(?:[T.,\s]\s*(.*))?$"
+    )
+    result = {}
+    for order, places in _ORDERS.items():
+        year, month, day = (parts[place] for place in places)
+        if order != "year first" or plain.str[2:3].eq("-").any():
+            year = year.where(year.str.len() != 2, "20" + year)
+        date = (year + "-" + month + "-" + day + " " + parts[3].fillna("")).str.strip()
+        times = pd.to_datetime(date, format="ISO8601", errors="coerce", utc=True)
+        for form in _TWELVE:
+            times = times.fillna(pd.to_datetime(date, format=form, errors="coerce", utc=True))
+        if times.notna().any():
+            result[order] = times
+    words = cells.where(cells.str.contains("[A-Za-z]{3}", na=False))
+    return result or {"": pd.to_datetime(words, errors="coerce", utc=True, format="mixed")}
+
+
+def _head_unit(head: str, numbers: pd.Series) -> str | None:
+    """Return the unit of numeric times."""
+    low, high = numbers.quantile((0.01, 0.99))
+    for unit, factor in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+        if _CLOCK_HEAD.search(head) and 9e8 < low / factor <= high / factor < 4e9:
+            return unit
+    words = re.sub(r"[^\wµμ]+|_", " ", head).strip()
+    found = (u for u, word in TIME_UNITS.items() if re.search(rf"(?i)\b(?:{word})$", words))
+    return next(found, None)
+
+
+def _evenness(times: pd.Series) -> int:
+    """Return the number of even differences, less the times that fall or are missing."""
+    known = times.dropna().astype("int64").to_numpy()
+    apart = np.diff(np.unique(known))
+    even = np.abs(apart - np.median(apart)) <= 0.1 * np.median(apart) if len(apart) else apart
+    changes = np.diff(known)
+    falls = min((changes < 0).sum(), (changes > 0).sum())
+    return int(even.sum() - falls - times.isna().sum())
+
+
+def pivoted(
+    times: pd.Series, table: pd.DataFrame, source: str, remarks: list[str]
+) -> tuple[pd.Series, pd.DataFrame]:
+    """Return the times and columns of a log with one row a reading as one row a time."""
+    heads = [str(head) for head in table.columns]
+    names, values = ([head for head in heads if form.fullmatch(head)] for form in (_NAMES, _VALUES))
+    if len(heads) == len(set(heads)) == 2 and times.duplicated().mean() > 0.3:
+        words = [h for h in heads if not table[h].str.match(r"[+-]?\d", na=False).any()]
+        names, values = words or names, [h for h in heads if h not in (words or names)]
+    if len(names) != 1 or len(values) != 1:
+        return times, table
+    (name,), (value,) = names, values
+    long = table.assign(time=times).dropna(subset=["time", name])
+    single = long.drop_duplicates(["time", name])
+    different, twice = single[name].nunique(), len(long) - len(single)
+    if different > LONGEST or twice > len(single) / 2:
+        raise ConfigurationError(
+            f"{source} is not allowed: its column {name!r} has {different} channels and {twice} "
+            f"readings at the time of another; export one place with at most {LONGEST} channels"
+        )
+    remarks += [f"{twice} readings at the time of another: the first counts"] if twice else []
+    remarks.append(f"one row a reading: columns are the values {value!r} of each {name!r}")
+    wide = single.pivot(index="time", columns=name, values=value)[single[name].unique()]
+    wide = wide.rename_axis(columns=None).reset_index()
+    return wide["time"], wide.drop(columns="time")
+
+
+def numbers_of(table: pd.DataFrame, source: str) -> tuple[Array, list[str]]:
+    """Return the numbers of the cells (rows, columns), and the units in the cells.
+
+    A column has a decimal point or a decimal comma: the sign that more cells allow. Where both
+    give other numbers, the sign of the other columns decides, or the numbers that vary less.
+    """
+    columns, units, counts = [], [], []
+    for place, name in enumerate(table.columns):
+        plain = table.iloc[:, place].str.replace("[\u00a0\u202f\u2009']", " ", regex=True)
+        parts = plain.str.replace("\u2212", "-").str.extract(f"^{_CELL}$")
+        own = parts[1].dropna().str.strip().unique()
+        if len(own) > 1:
+            raise ConfigurationError(
+                f"{source} is not allowed: its column {name!r} has units {own[:3].tolist()}"
+            )
+        units.append("".join(own))
+        columns.append((parts[0], {sign: _read(parts[0], sign) for sign in ".,"}))
+        counts.append({sign: int(v.notna().sum()) for sign, v in columns[-1][1].items()})
+    signs = {max(own, key=own.__getitem__) for own in counts if own["."] != own[","]}
+    result = np.full(table.shape, np.nan)
+    for place, ((texts, own), count) in enumerate(zip(columns, counts, strict=True)):
+        sign = max(count, key=count.__getitem__)
+        clear = count[sign] >= 0.9 * texts.notna().sum()
+        if count["."] == count[","] and not own["."].equals(own[","]):
+            spread = {key: v.std() / max(abs(v.mean()), 1e-300) for key, v in own.items()}
+            sign = min(signs) if len(signs) == 1 else min(spread, key=spread.__getitem__)
+            clear = len(signs) == 1 or max(spread.values()) > _SPREAD * spread[sign]
+            if not (clear or signs or texts.str.contains(",").any()):
+                sign, clear = ".", True
+        if not clear:
+            example = texts[texts.str.contains("[., ]", na=False)].iloc[0]
+            raise ConfigurationError(
+                f"{source} is not allowed: its column {table.columns[place]!r} has numbers such as "
+                f"{example!r}: their sign is decimal or separates thousands; write a decimal point"
+            )
+        result[:, place] = own[sign]
+    return result, units
+
+
+def _read(texts: pd.Series, sign: str) -> pd.Series:
+    """Return the numbers of texts with a decimal sign, NaN where a text has another form."""
+    group = "[, ]" if sign == "." else "[. ]"
+    whole = rf"\d*|[1-9]\d{{0,2}}(?:{group}\d{{3}})+"
+    form = rf"[+-]?(?:{whole})(?:\{sign}\d*)?(?:[eE][+-]?\d+)?"
+    plain = texts.where(texts.str.fullmatch(form, na=False)).str.replace(group, "", regex=True)
+    return pd.to_numeric(plain.str.replace(sign, "."), errors="coerce").astype(float)
+
+
+def on_even_times(
+    numbers: pd.DataFrame, times: pd.Series, source: str, remarks: list[str]
+) -> pd.DataFrame:
+    """Return the first reading of each channel at each step.
+
+    The interval is the median difference of a channel's own readings, or the shortest where the
+    others are multiples of it. A channel that reads later than the first by part of an interval
+    has its readings moved.
+    """
+    numbers = numbers[times.notna()].set_axis(pd.DatetimeIndex(times.dropna()), axis=0)
+    twice = int(numbers.index.duplicated().sum())
+    remarks += [f"{twice} rows at the time of another: the first reading counts"] if twice else []
+    numbers = numbers.groupby(level=0).first()
+    first, last = numbers.index[0], numbers.index[-1]
+    if first == last:
+        raise ConfigurationError(f"{source} is not allowed: all its rows have the same time")
+    clock = (numbers.index - first).total_seconds().to_numpy()
+    known = [clock[column] for column in numbers.notna().to_numpy().T]
+    apart = np.concatenate([np.diff(own) for own in known])
+    interval = _interval(apart if len(apart) else np.diff(clock), clock[-1])
+    steps = clock[-1] / interval
+    if first.year < _FIRST or last.year > _LAST or steps >= min(_MOST, 200 * len(clock)):
+        raise ConfigurationError(
+            f"{source} is not allowed: from {first} to {last} are {steps:,.0f} intervals of "
+            f"{interval:g} s, too many for its {len(numbers):,} rows; look for a wrong time"
+        )
+    phases = [_phase(own / interval) for own in known]
+    columns, merged, moved = dict[str, pd.Series](), 0, set[float]()
+    for name, own, phase in zip(numbers, known, phases, strict=True):
+        place = own / interval - phase
+        step = np.rint(place).astype(np.int64)
+        columns[name] = numbers[name].dropna().set_axis(step).groupby(level=0).first()
+        merged += len(own) - len(columns[name])
+        moved |= set(own[np.abs(place - step) > _OFF].tolist())
+        if abs(late := phase - phases[0]) > _PHASE and len(own):
+            shift = f"moved by {-late * interval:.4g} s to the steps of the others"
+            remarks.append(f"{len(own)} readings of {name}: {shift}")
+    remarks += [f"{len(moved)} times between the even ones: rounded"] if moved else []
+    remarks += [f"{merged} readings in the step of another: the first counts"] if merged else []
+    values = pd.DataFrame(columns)
+    ends = *values.index, *np.rint(clock[[0, -1]] / interval - phases[0]).astype(np.int64)
+    values = values.reindex(np.arange(min(ends), max(ends) + 1))
+    start = first.as_unit("ns") + pd.Timedelta(round(phases[0] * interval, 6), "s")
+    index = start + pd.Timedelta(round(interval * 1e9), "ns") * values.index.to_numpy()
+    return values.set_axis(pd.DatetimeIndex(index), axis=0)
+
+
+def _interval(differences: Array, span: float) -> float:
+    """Return the interval of differences in seconds, round where that moves no step."""
+    low, middle = np.quantile(differences, (0.1, 0.5), method="lower")
+    ratio = differences / low
+    even = np.mean(np.abs(ratio - np.rint(ratio)) <= _OFF * np.sqrt(ratio)) > 0.95
+    middle = low if even and middle <= 10.0 * low else middle
+    mean = float(differences[np.abs(differences - middle) <= 0.5 * middle].mean())
+    rounds = (round(mean / size) * size for size in _ROUND)
+    return next((r for r in rounds if r and abs(r - mean) * span <= 0.1 * mean * mean), mean)
+
+
+def _phase(steps: Array) -> float:
+    """Return the mean lateness of times, in (-1/2, 1/2] of a step; zero where they are uneven."""
+    mean = np.exp(2j * np.pi * steps).mean() if len(steps) else 0.0
+    return float(np.angle(mean)) / (2 * np.pi) if abs(mean) > 0.5 else 0.0

@@ -1,0 +1,150 @@
+"""Logs in formats that loggers and spreadsheets write, drawn with a seed, with their truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from fusion_gym.recordings import Recording
+
+ZERO = pd.Timestamp("1970-01-01")
+CODES = (-127.0, 85.0, -999.0, -9999.0, 9999.0)
+CLOCKS = ("%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y/%m/%d %H:%M:%S.%f",
+          "%d/%m/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S.%f",
+          "%m/%d/%Y %I:%M:%S %p", "%d.%m.%y %H:%M:%S.%f",
+          "unix", "time_ms", "elapsed [min]", "hours", "excel days")  # fmt: skip
+
+
+@dataclass
+class Drawn:
+    """The text of a log, and its true readings (T, channels) with even times."""
+
+    text: str
+    truth: pd.DataFrame
+    wrapped: str | None
+    features: dict[str, object]
+
+    def verdict(self, recording: Recording) -> str:
+        """Return what is wrong with the recording, or an empty text."""
+        values, truth = recording.values, self.truth
+        if set(values) != set(truth):
+            return f"channels {list(values)}"
+        interval = pd.Timedelta(self.features["seconds"], "s")
+        if abs(recording.interval - interval) > 1e-3 * interval:
+            return f"interval {recording.interval} for {interval}"
+        places = values.index.get_indexer(truth.index, method="nearest", tolerance=0.06 * interval)
+        own = values[list(truth)].to_numpy()
+        if (places < 0).any() or len(np.unique(places)) < len(places):
+            return "times"
+        if not np.allclose(own[places], truth, rtol=1e-12, equal_nan=True):
+            return "values"
+        if np.isfinite(np.delete(own, places, axis=0)).any():
+            return "readings at no time"
+        faults = {row.channel.name: row.fault for row in recording.card}
+        if self.wrapped and faults[self.wrapped] != "wraps around":
+            return "a wrapped channel"
+        return ""
+
+
+def draw_log(seed: int) -> Drawn:
+    """Return a log in a drawn format."""
+    draw = np.random.default_rng(seed)
+    clock = str(draw.choice(CLOCKS))
+    layout = str(draw.choice(["wide", "wide", "wide", "long", "TOA5"]))
+    seconds, rows = draw.choice([1, 10, 60, 300, 600, 3600]), int(draw.integers(150, 1200))
+    start = pd.Timestamp("2023-01-01") + pd.Timedelta(int(draw.integers(0, 700 * 144)) * 600, "s")
+    channels = int(draw.integers(1, 5))
+    decimals = draw.integers(1, 4, channels)
+    size = 10.0 ** draw.integers(0, 3, channels)
+    noise = draw.normal(size=(rows, channels))
+    path = np.zeros((rows, channels))
+    for row in range(1, rows):
+        path[row] = 0.9 * path[row - 1] + noise[row]
+    level = draw.choice([0.0, 20.0, 1000.0], channels)
+    values = np.array([[round(x, d) for x, d in zip(row, decimals, strict=True)]
+                       for row in level + size * path]) + 0.0  # fmt: skip
+    names = [f"s{place}" for place in range(channels)]
+    wrapped = None
+    if draw.random() < 0.15:
+        wrapped, values[:, 0] = names[0], np.round(350 + 8 * path[:, 0], 1) % 360.0
+    values[draw.random(values.shape) < draw.choice([0.0, 0.05])] = np.nan
+    cells = values.copy()
+    code = draw.choice(CODES) if draw.random() < 0.3 else None
+    if code is not None and wrapped is None and size[0] == 1.0 and level[0] < 1000.0:
+        hit = draw.random(rows) < 0.01
+        hit[:: rows // 4] = True
+        cells[hit, 0], values[hit, 0] = code, np.nan
+    even = start + pd.to_timedelta(np.arange(rows) * float(seconds), "s")
+    jitter = draw.choice([0.0, 1e-6, 0.01 * seconds])
+    if clock == "%m/%d/%Y %I:%M:%S %p":
+        jitter = 0.0
+    late = jitter * draw.random(rows)
+    real = even + pd.to_timedelta(np.round(late, 6), "s")
+    passed = (real - start).total_seconds().to_numpy()
+    head = "time"
+    if clock in ("unix", "time_ms", "elapsed [min]", "hours", "excel days"):
+        head = clock
+        size_of = {"unix": 1.0, "time_ms": 1e-3, "elapsed [min]": 60.0, "hours": 3600.0,
+                   "excel days": 86400.0}[clock]  # fmt: skip
+        absolute = real - (pd.Timestamp("1899-12-30") if clock == "excel days" else ZERO)
+        own = absolute.total_seconds().to_numpy()
+        own = own if clock in ("unix", "time_ms", "excel days") else passed
+        texts = [f"{x:.{12 if clock == 'excel days' else 9}f}" for x in own / size_of]
+        even = even if clock in ("unix", "time_ms", "excel days") else ZERO + (even - start)
+        if clock == "time_ms":
+            texts = [f"{x:.3f}" for x in own / size_of]
+    else:
+        texts = list(real.strftime(clock))
+    truth = pd.DataFrame(values, even, names)
+    separator, decimal = [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")][
+        draw.integers(5)
+    ]
+    thousands = draw.choice(["", "", {".": ",", ",": "."}[decimal], " "])
+    unit = draw.choice(["", " °C", " %"]) if layout == "wide" else ""
+
+    def written(value: float, place: int) -> str:
+        if np.isnan(value):
+            return ""
+        text = f"{value:,.{decimals[place]}f}".replace(",", "T").replace(".", decimal)
+        return text.replace("T", thousands) + unit
+
+    table = pd.DataFrame({name: [written(x, place) for x in cells[:, place]]
+                          for place, name in enumerate(names)})  # fmt: skip
+    heads = {name: draw.choice([name, f"{name} [m]"]) for name in names}
+    apart = draw.random() < 0.3 and "%H" in clock and "T" not in clock and layout == "wide"
+    if apart:
+        parts = pd.Series(texts).str.split(" ", n=1, expand=True)
+        table.insert(0, "date", parts[0])
+        table.insert(1, "time", parts[1])
+    else:
+        table.insert(0, head, texts)
+    if draw.random() < 0.2 and layout == "wide":
+        table["status"] = draw.choice(["ok", "warm", "late"], rows)
+    if draw.random() < 0.2:
+        lost = slice(rows // 3, rows // 3 + int(draw.integers(2, 40)))
+        table = table.drop(index=table.index[lost])
+        truth.iloc[lost] = np.nan
+    if draw.random() < 0.2:
+        twice = table.iloc[10:20]
+        table = pd.concat([table.iloc[:20], twice, table.iloc[20:]])
+    if draw.random() < 0.1:
+        table = table.iloc[::-1]
+    if layout == "long":
+        table = table.melt(id_vars=[head], var_name="sensor", value_name="value")
+        table = table[table["value"] != ""]
+    elif layout == "wide":
+        table = table.rename(columns=heads)
+    quoting = int(draw.choice([0, 0, 1]))
+    text = table.to_csv(index=False, sep=separator, quoting=quoting)
+    if layout == "TOA5":
+        width = table.shape[1]
+        top, body = text.split("\n", 1)
+        above = f'"TOA5","logger","CR1000"{separator}\n'.replace(",", separator)
+        units = separator.join(['"TS"', *['"m"'] * (width - 1)])
+        kinds = separator.join(['"Smp"'] * width)
+        text = f"{above}{top}\n{units}\n{kinds}\n{body}"
+    truth = truth.dropna(how="all")
+    features = {"clock": clock, "layout": layout, "seconds": seconds, "rows": rows, "apart": apart,
+                "separator": separator, "decimal": decimal, "thousands": thousands,
+                "jitter": jitter, "code": code, "quoting": quoting, "unit": unit}  # fmt: skip
+    return Drawn(text, truth, wrapped, features)
