@@ -10,7 +10,7 @@ QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_envir
 	tests/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
 	tests/test_benchmark.py::test_from_prices_to_pages_and_zoo
 
-.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers zoo newcomer pages docs integrations \
+.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers papers-check zoo newcomer pages docs integrations \
 	integrations-tianshou integrations-rejax integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
@@ -111,6 +111,9 @@ benchmark: $(STAMP)  ## triggers, rules and learned policies of every class, 110
 
 papers: $(STAMP)  ## the five papers' figures, tables and claims: docs/reproduction/
 	$(BIN)/python -m agents.papers all --resume
+
+papers-check: $(STAMP)  ## the papers' verdicts from a tenth of the episodes, against the pages'
+	$(BIN)/python -m agents.papers all --check --work runs/papers-check
 
 zoo: $(STAMP)  ## the best learned policies of the benchmark: fusion_gym/zoo/
 	$(BIN)/python -m agents.zoo

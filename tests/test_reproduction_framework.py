@@ -15,7 +15,7 @@ from hostile_folder import contents
 
 from agents import cache
 from agents.papers import checks, page, paper
-from agents.papers.numbers import Number
+from agents.papers.numbers import FAILS, HOLDS, Number
 from fusion_gym.validation import ConfigurationError
 
 USUAL = 30
@@ -199,6 +199,40 @@ def test_numbers_of_a_sample_have_its_moments() -> None:
     half = 1.96 * sample.std(ddof=1) / np.sqrt(2000)
     ends = (number.high - number.mean, number.mean - number.low)
     assert ends == pytest.approx((half, half), rel=0.1)
+
+
+@pytest.fixture
+def undecided(calls: Calls) -> Calls:
+    """The paper ``one`` has a claim that a hundred episodes decide."""
+    text = page.TEMPLATES / "one.md"
+    case = "first.count > 100 or below([-1, 1], 0)"
+    claim = '{% call claim("It is decided.", "Section 2", ' + case + ") %}So.{% endcall %}\n"
+    text.write_text(TEMPLATE.replace("{{ table(", claim + "{{ table("))
+    return calls
+
+
+def test_an_undecided_claim_gets_five_times_the_episodes(undecided: Calls) -> None:
+    reproduce("all")
+    counts = [(name, episodes) for name, episodes, _ in undecided]
+    first = [(f"{name}/{piece}", USUAL) for name in ("one", "two") for piece in PIECES]
+    assert counts == [*first, *((f"one/{piece}", 5 * USUAL) for piece in PIECES)]
+    numbers = json.loads(Path("pages/one.json").read_text())
+    assert [claim["verdict"] for claim in numbers["claims"]] == [HOLDS] * 4
+    assert numbers["made"]["first"]["episodes"] == 5 * USUAL
+
+
+def test_a_check_names_verdicts_that_contradict_the_pages(undecided: Calls) -> None:
+    reproduce("all")
+    undecided.clear()
+    before = pages()
+    assert "no verdict contradicts the pages" in reproduce("one", "--check").out
+    assert undecided == [(f"one/{piece}", USUAL // 10, 0) for piece in PIECES]
+    assert pages() == before
+    path = Path("pages/one.json")
+    path.write_text(path.read_text().replace(f'"verdict": "{HOLDS}"', f'"verdict": "{FAILS}"', 1))
+    ended = call("papers", ["one", "--check", "--output", "pages", "--work", "work"])
+    assert ended.status != 0
+    assert f"one claims | first: {HOLDS}, not {FAILS}" in ended.err
 
 
 # --- pages --------------------------------------------------------------------------------------

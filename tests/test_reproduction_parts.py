@@ -1,5 +1,6 @@
 """What the pages of the papers are computed by: recordings, measures, printed equations, bounds."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,19 @@ from agents.papers import unknown_input
 from agents.papers.adaptive_innovation_runs import _largest, _whitened
 from agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
 from agents.papers.markov_jump_covariances import covariances
-from agents.papers.numbers import cite, percent, verdict
+from agents.papers.numbers import (
+    DEPENDS,
+    FAILS,
+    HOLDS,
+    UNDECIDED,
+    above_zero,
+    always,
+    below,
+    cite,
+    outcome,
+    percent,
+    verdict,
+)
 from agents.papers.paper import NAMES
 from agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
 from agents.papers.unknown_input_recursion import gains, models
@@ -81,9 +94,19 @@ def test_a_bound_that_is_too_small_is_found() -> None:
 
 
 def test_verdicts_and_their_words() -> None:
-    assert verdict([True, True]) == "holds"
-    assert verdict([True, False]) == "holds partly"
-    assert verdict([False]) == "does not hold"
+    assert verdict([1.0, 1.0]) == HOLDS
+    assert verdict([0.0, 0.0]) == FAILS
+    assert verdict([1.0, math.nan, 0.0]) == DEPENDS
+    assert verdict([1.0, math.nan]) == verdict([0.0, math.nan]) == UNDECIDED
+    assert outcome([True, np.array([1.0, 1.0])]) == 1.0
+    assert outcome([math.nan, np.array([1.0, 0.0])]) == 0.0
+    assert math.isnan(outcome([math.nan, True]))
+    assert above_zero([0.1, -0.1, -0.2], [0.3, 0.1, 0.0]) == pytest.approx(
+        [1, np.nan, 0], nan_ok=True
+    )
+    assert always([0.99, 1.0], 200).tolist() == [0.0, 1.0]
+    assert always([0.99, 1.0], 100) == pytest.approx([0.0, np.nan], nan_ok=True)
+    assert pytest.approx(0.02, abs=5e-4) == 1.0 - 0.025 ** (1.0 / 185)
     assert cite(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
     assert percent((0.0, 0.4567, 0.9996, 1.0)) == "0 %, 46 %, 99.96 %, 100 %"
     assert percent(0.0004) == "0.04 %"
@@ -150,8 +173,25 @@ def test_a_paired_increase_is_reported_from_none() -> None:
 def test_one_point_above_is_told_from_all_below() -> None:
     error = np.full((100, 2), 1.0)
     one_above = np.where(np.arange(100)[:, None] == 3, 5.0, -5.0) * error
-    assert biased.always_below(np.stack([one_above, error]))[0] == "holds partly"
-    assert biased.always_below(np.stack([5 * error, error]))[0] == "does not hold"
+    one_open = np.where(np.arange(100)[:, None] == 3, 0.0, -5.0) * error
+    assert biased.always_below(np.stack([-5.0 * error, error])).outcome == 1.0
+    assert biased.always_below(np.stack([one_above, error])).outcome == 0.0
+    assert math.isnan(biased.always_below(np.stack([one_open, error])).outcome)
+
+
+@pytest.mark.parametrize("points", [1, 20])
+def test_below_is_wrong_in_at_most_a_fortieth_of_the_samples(points: int) -> None:
+    """Of equal means of any number of points; a difference and its median decide."""
+    rng, wrong = np.random.default_rng(0), 0
+    for _ in range(1000):
+        result = below(rng.normal(size=(points, 60)), rng.normal(size=(points, 60)))
+        wrong += bool((result == 1.0).any())
+    assert wrong <= 25 + 3 * math.sqrt(25)
+    far = rng.normal(size=(points, 60)) - 3.0
+    assert (below(far, 0.0) == 1.0).all()
+    assert (below(0.0, far) == 0.0).all()
+    skewed = rng.exponential(size=200) ** 4 - 4.0  # its mean is above 0, its median below
+    assert math.isnan(below(0.0, skewed))
 
 
 @pytest.mark.parametrize("latent", [-6.0, -1.0, 0.2, 5.5])

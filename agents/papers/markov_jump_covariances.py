@@ -27,6 +27,17 @@ def covariances(estimator: Any, sent: NDArray[np.bool_], swapped: bool) -> Array
     return blocks.transpose(0, 1, 3, 2, 4).reshape(times, count * states, count * states)
 
 
+def fused_traces(joint: Array, states: int) -> Array:
+    """Return the traces (H + 1,) of (57), (eᵀ Σ⁻¹ e)⁻¹, by pseudo-inverses of Σ (H + 1, l n, l n).
+
+    Source: markov_jump, Algorithm 1, with (45)-(51) and (57).
+    """
+    symmetric = 0.5 * (joint + np.swapaxes(joint, 1, 2))
+    every = np.tile(np.eye(states), (joint.shape[-1] // states, 1))
+    fused = np.linalg.pinv(every.T @ np.linalg.pinv(symmetric, hermitian=True) @ every)
+    return np.asarray(np.trace(fused, axis1=1, axis2=2))
+
+
 def _joint(estimator: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
     """Return P_ij (l, l, a, a) of the copies at k = 0..H."""
     filters, model = estimator.filters, estimator.model

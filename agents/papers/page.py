@@ -6,35 +6,68 @@ from typing import Any
 
 import jinja2
 import matplotlib.pyplot as plt
+from PIL import Image
 
-from agents.papers.numbers import below, cite, estimate, number_text, percent, verdict
+from agents.papers.numbers import (
+    DEPENDS,
+    MISPRINT,
+    always,
+    below,
+    by_mean,
+    cite,
+    estimate,
+    number_text,
+    outcome,
+    percent,
+    verdict,
+)
 from agents.papers.paper import NAMES, Data, Paper, PaperFigure
 from fusion_gym.entries import Plain
 from fusion_gym.output import palette
 from fusion_gym.output.files import read_json, replacing, write, write_text
 
+_COLOURS = 64  # of a PNG, a third of the bytes of all
 OVERVIEW = "README.md"
 TEMPLATES = Path(__file__).parent
 Counts = Mapping[str, Mapping[str, int]]  # episodes and seed of each piece
+Results = Mapping[str, Mapping[str, Data]]  # of the pieces, by reading
 
 
-def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> tuple[str, Plain]:
+def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Plain]:
     """Return a paper's Markdown from the data of all its pieces, and its numbers as plain JSON."""
-    pieces = {
-        piece.name: results[piece.name] | piece.summarise(results[piece.name])
-        for piece in paper.pieces
-    }
+    outcomes: dict[str, dict[str, float]] = {}  # by claim and reading
     claims: list[dict[str, str]] = []
+    reading, pieces = "", dict[str, Data]()
 
     def claim(text: str, source: str, parts: Any, caller: Callable[[], str]) -> str:
-        result = parts if isinstance(parts, str) else verdict(parts)
-        row = {"text": text, "source": source, "verdict": result, "evidence": caller()}
-        claims.append({name: _line(value) for name, value in row.items()})
-        cells = claims[-1] | {"verdict": f"**{result}**"}
+        text, source = _line(text), _line(source)
+        result, own = parts, outcomes.setdefault(f"{source}: {text}", {})
+        if not isinstance(parts, str):
+            cases = parts if isinstance(parts, Mapping) else {"": parts}
+            own |= {f"{reading}{case}": outcome(value) for case, value in cases.items()}
+            result = verdict(own.values())
+        where = ", ".join(name for name, value in own.items() if value == 1.0)
+        region = f": holds with {where}" if result == DEPENDS else ""
+        row = {"text": text, "source": source, "verdict": result, "evidence": _line(caller())}
+        claims.append(row)
+        cells = row | {"verdict": f"**{result}**{region}"}
         return f"| {' | '.join(map(_cell, cells.values()))} |\n"
 
+    def tally() -> list[tuple[str, int]]:
+        """Return the number of claims that hold under each reading."""
+        judged = [own for own in outcomes.values() if set(own) == set(results)]
+        return [(name, sum(own[name] == 1.0 for own in judged)) for name in results]
+
     template = _template(f"{paper.name}.md")
-    text = template.render(pieces, paper=paper.name, claim=claim, counts=counts)
+    for reading in [*results][::-1]:  # the environment's is the last, and the page's
+        claims.clear()
+        pieces = {
+            piece.name: results[reading][piece.name] | piece.summarise(results[reading][piece.name])
+            for piece in paper.pieces
+        }
+        text = template.render(
+            pieces, paper=paper.name, claim=claim, counts=counts, tally=tally, misprint=MISPRINT
+        )
     lines = text.splitlines()
     tables = [
         {
@@ -55,13 +88,15 @@ def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> tu
     }
 
 
-def write_page(paper: Paper, results: Mapping[str, Data], counts: Counts, output: Path) -> None:
-    """Write a paper's pictures, its page and its numbers."""
+def write_page(paper: Paper, results: Results, counts: Counts, output: Path) -> Plain:
+    """Write a paper's pictures, its page and its numbers, and return the numbers."""
     text, numbers = render_page(paper, results, counts)
     for name, figure in paper.figures.items():
-        write_figure(figure, results[figure.piece], output / paper.name / name)
+        data = results[next(iter(paper.readings))][figure.piece]
+        write_figure(figure, data, output / paper.name / name)
     write_text(output / f"{paper.name}.md", text)
     write(output / f"{paper.name}.json", numbers)
+    return numbers
 
 
 def write_overview(output: Path) -> None:
@@ -85,7 +120,12 @@ def _template(name: str) -> jinja2.Template:
     environment.filters |= {
         "cell": _cell, "cite": cite, "line": _line, "number": number_text, "percent": percent,
     }  # fmt: skip
-    environment.globals |= {"below": below, "estimate": estimate}
+    environment.globals |= {
+        "always": always,
+        "below": below,
+        "by_mean": by_mean,
+        "estimate": estimate,
+    }
     return environment.get_template(name)
 
 
@@ -117,6 +157,10 @@ def write_figure(figure: PaperFigure, data: Data, path: Path) -> None:
             for suffix in ("png", "svg"):
                 with replacing(path.with_name(f"{path.name}.{suffix}")) as partial:
                     drawing.savefig(partial, format=suffix, metadata=_UNDATED[suffix])
+                    if suffix == "png":
+                        with Image.open(partial) as picture:
+                            reduced = picture.convert("RGB").quantize(_COLOURS)
+                        reduced.save(partial, "PNG", optimize=True)
         finally:
             plt.close(drawing)
 

@@ -94,6 +94,8 @@ class Paper(NamedTuple):
     """A paper: its pieces in the order of its page, its figures by name, and its parameters.
 
     ``options`` names the options of ``environment`` that a figure may change as well.
+    ``readings`` assign what the text leaves open to parameters and options, the environment's
+    first.
     """
 
     name: str
@@ -102,6 +104,7 @@ class Paper(NamedTuple):
     environment: str
     parameters: Mapping[str, Parameter] = NOTHING
     options: Sequence[str] = ()
+    readings: Mapping[str, Settings] = MappingProxyType({"": NOTHING})
 
     def settings(self, changes: Settings, without: Sequence[str] = ()) -> Data:
         """Return the changed parameters, and changed options as ``options``, except ``without``."""

@@ -20,7 +20,14 @@ from typing import Annotated, Any
 import tyro
 
 from agents.cache import Cache
-from agents.papers.page import draw_figure, write_figure, write_overview, write_page
+from agents.papers.numbers import LARGER, UNDECIDED
+from agents.papers.page import (
+    draw_figure,
+    render_page,
+    write_figure,
+    write_overview,
+    write_page,
+)
 from agents.papers.paper import (
     NAMES,
     NOTHING,
@@ -38,10 +45,12 @@ from fusion_gym.commands.options import OUTPUT_FOLDER, Seed, whole
 from fusion_gym.entries import Plain
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.output.ending import ended_like_by_ctrl_c
-from fusion_gym.output.files import lock_folder
+from fusion_gym.output.files import lock_folder, read_json
 from fusion_gym.output.progress import writing
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.validation import integer
+from fusion_gym.validation import ConfigurationError, integer
+
+_SHARE = 0.1  # of the episodes, for a check
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,8 @@ class Reproduce(Long):
     """Episodes of every simulation, instead of its own number."""
     seed: Seed = 0
     """Seed of the first episode."""
+    check: bool = False
+    """Judge by a tenth of the episodes, and fail where a verdict contradicts the pages."""
     resume: bool = False
     """Reuse finished simulations."""
     output: Annotated[Path | None, OUTPUT_FOLDER] = None
@@ -83,25 +94,63 @@ class Reproduce(Long):
         elif changes:
             reason = "the claims of the pages need the papers' parameters"
             raise forbidden("set", next(iter(changes)), reason, "without --figure")
+        elif self.check:
+            self._check_verdicts(papers, self.output or Path("docs/reproduction"))
         else:
             self._reproduce_pages(papers, self.output or Path("docs/reproduction"))
 
     def _reproduce_pages(self, papers: list[Paper], output: Path) -> None:
         with ended_like_by_ctrl_c(), lock_folder(self.work, "work"):
             writing(("simulations", self.work), ("pages", output))
-            jobs = {
-                (paper.name, piece.name): self._job(piece, paper.settings({}))
-                for paper in papers
-                for piece in paper.pieces
-            }
-            results = dict(zip(jobs, self._simulate(list(jobs.values())), strict=True))
-            for paper in papers:
-                names = [piece.name for piece in paper.pieces]
-                data = {name: results[paper.name, name] for name in names}
-                counts = {name: jobs[paper.name, name].counts for name in names}
-                write_page(paper, data, counts, output)
-                print(f"{paper.name}: {output / paper.name}.md")
+            for factor in (1.0, LARGER):
+                undecided = []
+                for paper, results, counts in self._judge(papers, factor):
+                    claims = write_page(paper, results, counts, output)["claims"]
+                    print(f"{paper.name}: {output / paper.name}.md")
+                    if UNDECIDED in {claim["verdict"] for claim in claims}:
+                        undecided.append(paper)
+                papers = undecided
             write_overview(output)
+
+    def _check_verdicts(self, papers: list[Paper], output: Path) -> None:
+        with ended_like_by_ctrl_c(), lock_folder(self.work, "work"):
+            differing = []
+            for paper, results, counts in self._judge(papers, _SHARE):
+                own = render_page(paper, results, counts)[1]["claims"]
+                stored = read_json(output / f"{paper.name}.json", "numbers")["claims"]
+                for new, old in zip(own, stored, strict=True):
+                    same = new["verdict"] in (old["verdict"], UNDECIDED)
+                    if new["text"] != old["text"] or not (same or old["verdict"] == UNDECIDED):
+                        differing.append(f"{new['text']}: {new['verdict']}, not {old['verdict']}")
+        if differing:
+            raise ConfigurationError(f"other verdicts than in {output}: " + "; ".join(differing))
+        print("no verdict contradicts the pages")
+
+    def _judge(
+        self, papers: list[Paper], factor: float
+    ) -> list[tuple[Paper, dict[str, dict[str, Data]], dict[str, dict[str, int]]]]:
+        """Return each paper's data by reading and piece, and the episodes of its pieces."""
+        jobs = {
+            (paper.name, reading, piece.name): self._job(
+                piece, paper.settings(changes), factor=factor
+            )
+            for paper in papers
+            for reading, changes in paper.readings.items()
+            for piece in paper.pieces
+        }
+        data = dict(zip(jobs, self._simulate(list(jobs.values())), strict=True))
+        return [
+            (
+                paper,
+                {
+                    reading: {item.name: data[paper.name, reading, item.name] for item in pieces}
+                    for reading in paper.readings
+                },
+                {item.name: jobs[paper.name, first, item.name].counts for item in pieces},
+            )
+            for paper in papers
+            for pieces, first in [(paper.pieces, next(iter(paper.readings)))]
+        ]
 
     def _reproduce_figure(self, paper: Paper, name: str, changes: Plain) -> None:
         name, figure = paper.figure(name)
@@ -112,8 +161,11 @@ class Reproduce(Long):
             write_figure(figure, self._simulate([job])[0], path)
         print(f"{paper.name}: {path}.png")
 
-    def _job(self, piece: Piece, settings: Data, restriction: Settings = NOTHING) -> PieceJob:
-        return PieceJob(piece, self.episodes or piece.usual, self.seed, settings, dict(restriction))
+    def _job(
+        self, piece: Piece, settings: Data, restriction: Settings = NOTHING, factor: float = 1.0
+    ) -> PieceJob:
+        episodes = max(round(factor * (self.episodes or piece.usual)), 2)
+        return PieceJob(piece, episodes, self.seed, settings, dict(restriction))
 
     def _simulate(self, jobs: Sequence[PieceJob]) -> list[Data]:
         """Return the data of all jobs, from the work folder or simulated."""

@@ -16,7 +16,7 @@ from agents.papers import checks
 from agents.papers import round_robin_tobit_runs as runs
 from agents.papers import round_robin_tobit_theorems as theorems
 from agents.papers.drawing import legend, stack
-from agents.papers.numbers import Number
+from agents.papers.numbers import Number, above_zero
 from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
@@ -156,7 +156,7 @@ def _summarise_nodes(data: Data) -> Data:
                 ends = (data[f"{name}_{sensor}_increase"][end][states] for end in _ENDS)
                 rises.append(list(map(Interval, *ends)))
                 often.append(runs.always_below(data[f"{name}_{sensor}_difference"][..., states]))
-            higher = [interval.low > 0.0 for rise in rises for interval in rise]
+            higher = [above_zero(item.low, item.high) for rise in rises for item in rise]
             claims[f"{what}_{name}"] = {"higher": higher, "rises": rises, "often": often}
     return {
         "columns": columns,
@@ -263,8 +263,8 @@ def _summarise_tables(data: Data) -> Data:
     return {
         "tables": numbers | {"others": references}, "heads": heads,
         "printed_rows": list(zip(variance_names, TABLE_III.values(), third, strict=True)),
-        **_broken(data, printed), "narrow": _moves(second, "low", 1.0),
-        "noise": _moves(third, "high", -1.0),
+        **_broken(data, printed), "narrow": _moves(second, 1),
+        "noise": _moves(third, -1),
     }  # fmt: skip
 
 
@@ -292,12 +292,12 @@ def _broken(data: Data, printed: Plain) -> Data:
     }  # fmt: skip
 
 
-def _moves(rows: list[Data], end: str, sign: float) -> Data:
+def _moves(rows: list[Data], sign: int) -> Data:
     """Return which errors change from row to row as claimed: ARMSE and the median."""
-    moved = {
-        name: np.array([sign * np.array(row[name]["rise"][end]) for row in rows[1:]]).min(0) > 0
-        for name in _FILTERS
-    }
+    moved = {}
+    for name in _FILTERS:
+        rises = ([row[name]["rise"][end] for row in rows[1:]] for end in ("low", "high")[::sign])
+        moved[name] = above_zero(*((sign * np.array(rise)).min(0) for rise in rises))
     return {
         "moved": moved, "chain": [row["paper"]["mean"] for row in rows],
         "medians": [row["paper"]["median"][0] for row in rows],

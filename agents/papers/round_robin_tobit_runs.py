@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import fusion_gym
-from agents.papers.numbers import Number, Verdict
+from agents.papers.numbers import Number
 from agents.papers.walk import walk, walk_in_parts
 from fusion_gym import gaussian
 from fusion_gym.arrays import Array
@@ -25,7 +25,6 @@ STATES = 3  # x1, x2, b
 PAPER_RUNS = 1000
 _RESAMPLES = 500
 _CLEAR = 4.0  # standard errors: of 200 comparisons without a difference none is likely to reach it
-_MOST = 0.5  # share of the points
 FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
 
 
@@ -151,7 +150,7 @@ def floor(env: str, **options: Any) -> list[float]:
 class Comparison(NamedTuple):
     """At how many points one curve is clearly lower, clearly higher, or lower by the mean."""
 
-    verdict: Verdict
+    outcome: float
     lower: int
     higher: int
     by_mean: int
@@ -162,16 +161,12 @@ def always_below(difference: Array) -> Comparison:
     """Return whether one curve lies below another at every step, and at how many points.
 
     ``difference`` (2, H, …) is the mean of the paired differences of squared errors with its
-    standard error. It holds if no point has the other order by more than chance and more than half
-    are clearly lower; partly if more points are clearly lower than higher.
+    standard error. It holds if all points are clearly lower, and fails if one is clearly higher.
     """
     mean, error = difference
     lower = (mean < -_CLEAR * error) & (error > 0)
     higher = (mean > _CLEAR * error) & (error > 0)
-    if not higher.any() and lower.mean() > _MOST:
-        result: Verdict = "holds"
-    else:
-        result = "holds partly" if lower.sum() > higher.sum() else "does not hold"
+    result = 0.0 if higher.any() else 1.0 if lower.all() else np.nan
     return Comparison(result, lower.sum(), higher.sum(), (mean < 0).sum(), mean.size)
 
 

@@ -251,7 +251,7 @@ def _summarise_bucket_readings(data: Data) -> Data:
         "Kalman filters that ignore censoring, the paper's trigger and bucket": [data["ignoring"]],
         "the paper's filter, always sending, no bucket": [data["always"]],
     }
-    not_below = ~below(data["fused"][:, None], data["local"])
+    not_below = below(data["fused"][:, None], data["local"]) != 1.0
     return {
         "columns": _WHO, "not_below": [(np.flatnonzero(row) + 1).tolist() for row in not_below],
         "tables": {"readings": grid(_WHO, rows), "beside": grid(("fused",), others)},

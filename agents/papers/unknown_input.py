@@ -5,6 +5,7 @@ Source: unknown_input, Section 4.
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +45,15 @@ LANES: dict[str, tuple[str, Options]] = {
 KINDS = ("states", "inputs")
 _HOLD = {PRINTED: {"hold_variance": 0.05}}  # as the example's page does
 _SMALL = 0.2  # ρ̄ over the noise's variance, where (1 + 1/ε) ρ̄ - V is negative
+_CHANGE = 0.2  # deviation of a random-walk input's change over its own
+_STEPS: Options = {"input_signal": "steps", "input_amplitude": 150.0}
+# The input that the text leaves open, of the printed example.
+READINGS: dict[str, Options] = {
+    "sinusoids of 0.1": {},
+    "sinusoids of 150": {"input_amplitude": 150.0},
+    "steps of 150 in 30 instants": _STEPS | {"input_period": 30.0},
+    "steps of 150 in 100 instants": _STEPS | {"input_period": 100.0},
+}
 _FACTOR = {PRINTED: 1.0, CARTS: 0.2}  # ε = ξ, as in the library's examples
 
 
@@ -130,9 +140,12 @@ def _example(
     for name in lanes:
         policy, options = LANES[name]
         policy = settings["policy"] if policy == TRIGGER else policy
-        options = {"example": example} | options | settings["options"]
+        own = _options_of(example, settings)
+        options = options | own | {"example": example}
         if name == WALK:
             options |= _HOLD.get(example, {})
+            if size := float(own.get("input_amplitude", 0.0)):
+                options["input_change"], options["input_deviation"] = _CHANGE * size, size
         task, plant = make_example(**options)
         rule = fusion_gym.make_policy(settings["policy"], task)
         assert isinstance(rule, AdaptiveThreshold)
@@ -146,6 +159,14 @@ def _example(
         if name == WALK:
             data["walk"] = record.fused[..., 0]
     return data | {"mse": np.array(mse), "rates": np.array(rates)}
+
+
+def _options_of(example: str, settings: Settings) -> Options:
+    """Return the options of an example; the carts keep their input."""
+    options: Options = settings["options"]
+    if example == PRINTED:
+        return options
+    return {name: value for name, value in options.items() if not name.startswith("input_")}
 
 
 def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> Data:
@@ -185,7 +206,7 @@ def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> D
         "bound": np.moveaxis(np.diagonal(bounds, axis1=1, axis2=2), 1, 0),
         "each": halves((errors**2).mean(0), n, 1), "filled": np.array(filled),
         "power": halves((record.truth**2).mean(0), n, 0), "steady": np.array(steady),
-        "within": float((record.square <= high)[silent].mean()),
+        "within": 1.0 - float((record.square > high)[silent].sum()) / max(silent.sum(), 1),
         "rho_range": [np.diff(rho, axis=0).min(), (rho / low).min(), (rho / high).max()],
         "settled": (rho < 0.99 * limit).sum(0).max(0).astype(float), "radius": nodes.tables.radius,
     }  # fmt: skip
@@ -238,6 +259,7 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
     for reading in recursion.UNKNOWN_INPUT_READINGS.values():
         options, policy = reading.get("options", {}), reading.get("policy", TRIGGER)
         cutoff = reading.get("cutoff", EXACT_CUTOFF)
+        options = _options_of(PRINTED, settings) | options
         record, every = _recursion(PRINTED, policy, episodes, seed, cutoff, **options)
         estimates = [np.moveaxis(each["estimate"], 1, 2) for each in every]
         errors = record.truth[:, None] - np.stack(estimates, axis=1)
@@ -246,18 +268,23 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
         hidden.append([float(each["hidden"].max()) for each in every])
     data |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
     data["power"] = halves((record.truth**2).mean(0), 2, 0)
-    runs = [_recursion(example, TRIGGER, episodes, seed) for example in EXAMPLES]
+    runs = [
+        _recursion(example, TRIGGER, episodes, seed, **_options_of(example, settings))
+        for example in EXAMPLES
+    ]
     excess = [np.mean([each["excess"].mean(0) for each in every], axis=0) for _, every in runs]
     record, every = runs[0]
     traces, granted = np.stack([each["trace"] for each in every], axis=1), record.granted
     for name, where in (("silent", ~granted), ("sent", granted)):
-        data[name] = np.nanmean(np.where(where, traces, np.nan), axis=0)
+        data[name] = (where * traces).sum(0) / np.maximum(where.sum(0), 1)
     small = _SMALL * 0.001
-    record, every = _recursion(PRINTED, TRIGGER, episodes, seed, rho_bar=small, rho_initial=small)
+    low = _options_of(PRINTED, settings) | {"rho_bar": small, "rho_initial": small}
+    record, every = _recursion(PRINTED, TRIGGER, episodes, seed, **low)
     least = np.stack([each["least"] for each in every], axis=1)
     paper = make_example(example=PRINTED, filter="paper")[1]
     every_step = make_example(example=PRINTED, filter="paper", sampling_period=1)[1]
-    negative = float((least[~record.granted] < 0.0).mean())
+    silent = ~record.granted
+    negative = float((least[silent] < 0.0).sum()) / max(int(silent.sum()), 1)
     data |= {"excess": np.array(excess), "negative": negative, "small": small}
     return data | recursion.decoupling(paper, every_step)
 
@@ -453,5 +480,7 @@ PAPER = Paper(
     },
     "fusion_gym/UnknownInput-v1",
     {"policy": Parameter(TRIGGER, checks.policy_of(TRIGGER))},
-    ("horizon", "rho_bar", "rho_initial", "adaptation"),
+    (*("horizon", "rho_bar", "rho_initial", "adaptation"),
+     *("input_signal", "input_amplitude", "input_period")),
+    {name: MappingProxyType(options) for name, options in READINGS.items()},
 )  # fmt: skip

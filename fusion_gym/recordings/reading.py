@@ -291,7 +291,7 @@ def _read(texts: pd.Series, sign: str) -> pd.Series:
     whole = rf"\d*|[1-9]\d{{0,2}}(?:{group}\d{{3}})+"
     form = rf"[+-]?(?:{whole})(?:\{sign}\d*)?(?:[eE][+-]?\d+)?"
     plain = texts.where(texts.str.fullmatch(form, na=False)).str.replace(group, "", regex=True)
-    return pd.to_numeric(plain.str.replace(sign, "."), errors="coerce").astype(float)
+    return plain.str.replace(sign, ".", regex=False).astype(float)
 
 
 def on_even_times(

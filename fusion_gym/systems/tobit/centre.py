@@ -151,7 +151,7 @@ class NodeCentre(Centre):
     was derived, so "ici" keeps its bound here. With a single delivery every form returns the node
     that received it.
 
-    Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (28).
+    Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (27).
     """
 
     filter: NodeFilter
