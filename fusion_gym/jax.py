@@ -95,10 +95,11 @@ class FunctionalEnv:
         self.default_params = EnvParams(price)
         if isinstance(estimator, CensoredEstimator):
             shares = getattr(estimator.centre, "share", None)
+            model, sensors = estimator.model, estimator.centre.sensors
             self.default_params = EnvParams(
                 price,
-                estimator.model.process_covariance[..., 0],
-                estimator.centre.sensors.variance[..., 0],
+                model.process_covariance[..., 0] if model.schedule is None else None,
+                sensors.variance[..., 0] if sensors.schedule is None else None,
                 None if shares is None else shares[:, 0],
             )
 

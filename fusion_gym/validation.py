@@ -176,6 +176,17 @@ def read_text(field: str, path: Path, name: str | None = None) -> str:
         raise ConfigurationError(f"{field} = {label!r} cannot be read: {reason}") from None
 
 
+def entries(
+    field: str, value: Any, kind: str, owner: str = "sensor", count: int | None = None
+) -> list[Any]:
+    """Return the entry of each sensor, or of each step, up to ``LONGEST_HORIZON``."""
+    listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim > 0)
+    if not listed or len(value) not in ([count] if count else range(1, LONGEST_HORIZON + 1)):
+        many = f"each {owner}" if count is None else f"each of the {count} {owner}s"
+        raise refusal(field, value, f"a list with {kind} for {many}")
+    return list(value)
+
+
 def boolean(field: str, value: Any) -> bool:
     """Return ``True`` or ``False``."""
     if not isinstance(value, (bool, np.bool_)):

@@ -231,7 +231,7 @@ def _cycle(task: Task) -> int:
         raise ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(estimator).__name__}: its "
             "covariances must depend only on deliveries, as in MarkovJumpTracking-v1 with "
-            "filter='local' or 'centralised', CorrelatedTracking-v1, or UnknownInput-v1 with "
-            "filter='random_walk' or 'predict'"
+            "filter='local' or 'centralised', CorrelatedTracking-v1 without a schedule, or "
+            "UnknownInput-v1 with filter='random_walk' or 'predict'"
         )
     return estimator.covariance_cycle

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +15,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
 from fusion_gym.namespace import in_runs
+from fusion_gym.systems.schedule import MatrixSchedule, Scheduled
 
 _SEEN, _NOTHING = 1e-9, 1e-300  # relative rounding of a rank, and the least length
 _CANCELLED = 1e-3  # of what is summed; what is left has lost three digits
@@ -25,7 +27,7 @@ def covariance_factor(matrix: Array) -> Array:
     return np.ascontiguousarray(factor[:, factor.any(0)])
 
 
-def initial_law(mean: ArrayLike, covariance: ArrayLike, size: int) -> dict[str, Array]:
+def initial_law(mean: ArrayLike, covariance: ArrayLike, size: int) -> dict[str, Any]:
     """Return the checked mean, covariance and factor of x(0), by field of a plant."""
     start = validation.covariance("initial_covariance", covariance, size)[..., None]
     return {
@@ -35,7 +37,7 @@ def initial_law(mean: ArrayLike, covariance: ArrayLike, size: int) -> dict[str, 
     }
 
 
-class Sensors:
+class Sensors(Scheduled):
     """The common part of linear sensors: C (sensors, m, n, 1), a noise for each component."""
 
     measurement_matrix: Array
@@ -57,7 +59,7 @@ class Sensors:
 
 
 @dataclass(frozen=True)
-class LinearDynamics:
+class LinearDynamics(Scheduled):
     """The common part of linear plants: A, the noise w ~ N(0, W) and the law of x(0).
 
     Shapes: ``transition`` A (n, n, 1), ``process_covariance`` W (n, n, 1), ``process_factor``
@@ -83,9 +85,9 @@ class LinearDynamics:
         return self.process_factor.shape[1]
 
     def true_radius(self, factor: float) -> float:
-        """Spectral radius of I + c (A - I)."""
+        """Spectral radius of I + c (A - I), the largest of all steps."""
         still = np.eye(self.size)
-        moved = still + factor * (self.transition[..., 0] - still)
+        moved = still + factor * (np.moveaxis(self.each_step.transition, -1, 0) - still)
         return float(np.abs(np.linalg.eigvals(moved)).max())
 
     def warn_of_unseen_growth(self, rows: Array, names: Sequence[str]) -> None:
@@ -107,8 +109,9 @@ class LinearDynamics:
     @property
     def unmoved(self) -> tuple[str, ...]:
         """Options of the true plant that have no effect."""
-        still = np.array_equal(self.transition[..., 0], np.eye(self.size))
-        result = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
+        every = self.each_step
+        still = bool((every.transition == linalg.identity(self.size)).all())
+        result = {"true_process_noise": not every.process_factor.any(), "true_transition": still}
         return tuple(name for name, absent in result.items() if absent)
 
 
@@ -116,8 +119,12 @@ class LinearDynamics:
 class LinearPlant(LinearDynamics):
     """x(t+1) = A x(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
 
+    With a ``schedule`` A and W depend on t.
+
     Source: tobit_token_bucket, equation (1).
     """
+
+    schedule: MatrixSchedule | None = None
 
     @classmethod
     def create(
@@ -181,12 +188,9 @@ class LinearPlant(LinearDynamics):
             return linalg.matvec(self.transition, mean), prior
         most = linalg.total(self._cancelling * linalg.diagonal(covariance)[..., None, :, :])
         cancelled = linalg.diagonal(prior) < most
-        (prior,) = in_runs(cancelled, self._predict_root, (covariance,), (prior,))
+        parts = covariance, self.transition, self.process_covariance
+        (prior,) = in_runs(cancelled, _predict_root, parts, (prior,))
         return linalg.matvec(self.transition, mean), prior
-
-    def _predict_root(self, covariance: Array) -> tuple[Array]:
-        moved = linalg.matmul(self.transition, linalg.root(covariance))
-        return (linalg.gram(moved) + self.process_covariance,)
 
     @functools.cached_property
     def _known_start(self) -> bool:
@@ -213,15 +217,20 @@ class LinearPlant(LinearDynamics):
 
         ``square`` m mᵀ of the initial mean m gives the state's second moments instead.
         """
-        transition, process = self.transition[..., 0], self.process_covariance[..., 0]
         moment = self.initial_covariance[..., 0] + square
         yield moment
-        for _ in range(horizon):
+        for step in range(horizon):
+            plant = self.at(np.full(1, step))
+            transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
             root, moment = moment, transition @ moment @ transition.T + process
             if (np.diagonal(moment) < 0.0).any():  # it has cancelled
                 root = transition @ covariance_factor(root)
                 moment = root @ root.T + process
             yield moment
+
+
+def _predict_root(covariance: Array, transition: Array, process: Array) -> tuple[Array]:
+    return (linalg.gram(linalg.matmul(transition, linalg.root(covariance))) + process,)
 
 
 def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
@@ -236,7 +245,9 @@ def largest_ratio(moments: Array, rows: Array) -> float:
     return float((np.sqrt(moments) @ finest).max() ** 2)
 
 
-def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -> float:
+def variance_loss(
+    plant: LinearPlant, horizon: int, packets: Callable[[int], Iterable[tuple[Array, Array]]]
+) -> float:
     """Return the largest ratio of predicted variances, with their rounding, to updated variances.
 
     The update follows silence until one of sixteen times. With G = I - K C and the prediction P,
@@ -245,23 +256,22 @@ def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -
     Args:
         plant: the plant.
         horizon: steps of an episode.
-        rows: C (..., m, n) of the packets.
-        noise: R (..., m, m) of the packets.
+        packets: function that returns C (..., m, n) and R (..., m, m) of packets at a time.
     """
     times = np.geomspace(1, horizon, 16).round()
     largest = 0.0
     for time, prior in enumerate(plant.moments(horizon)):
-        if time not in times:
-            continue
-        cross = rows @ prior
-        try:
-            gain = np.linalg.solve(cross @ rows.swapaxes(-1, -2) + noise, cross).swapaxes(-1, -2)
-        except np.linalg.LinAlgError:  # the noise drowns
-            return np.inf
-        keep = np.eye(plant.size) - gain @ rows
-        left = ((keep @ prior) * keep).sum(-1) + ((gain @ noise) * gain).sum(-1)
-        rounded = (np.abs(keep) @ np.sqrt(np.diagonal(prior))) ** 2
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(rounded > 0.0, rounded / np.maximum(left, 0.0), 0.0)
-        largest = float(np.maximum(largest, ratio.max()))
+        for rows, noise in packets(time) if time in times else ():
+            cross = rows @ prior
+            try:
+                gain = np.linalg.solve(cross @ rows.swapaxes(-1, -2) + noise, cross)
+            except np.linalg.LinAlgError:  # the noise drowns
+                return np.inf
+            gain = gain.swapaxes(-1, -2)
+            keep = np.eye(plant.size) - gain @ rows
+            left = ((keep @ prior) * keep).sum(-1) + ((gain @ noise) * gain).sum(-1)
+            rounded = (np.abs(keep) @ np.sqrt(np.diagonal(prior))) ** 2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = np.where(rounded > 0.0, rounded / np.maximum(left, 0.0), 0.0)
+            largest = float(np.maximum(largest, ratio.max()))
     return largest

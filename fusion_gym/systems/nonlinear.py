@@ -207,13 +207,14 @@ class NonlinearPlant(NormalPlant):
         size, system = len(self.state_names), self.system
         mean = np.repeat(system.initial_mean[:, None], noise.shape[-1], axis=1)
         truth = mean + linalg.root(system.initial_covariance[..., None])[..., 0] @ noise[:size]
-        return Truth(truth, system.measured(truth, noise[size:]), None), None
+        time = np.zeros(noise.shape[-1])
+        return Truth(truth, system.measured(truth, noise[size:]), None, time), None
 
     def sense(self, state: Truth, noise: Array) -> Truth:
         """Move the plant, and measure."""
         own = self.system.process_channels
         truth = self.system.move(state.truth, noise[:own])
-        return Truth(truth, self.system.measured(truth, noise[own:]), None)
+        return Truth(truth, self.system.measured(truth, noise[own:]), None, state.time + 1.0)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""

@@ -24,12 +24,13 @@ class Truth:
     """The true state of N runs at one time; n states, l sensors, m channels.
 
     ``truth`` (n, N) · ``measurement`` (l, m, N) · ``departure`` (4, N) of the truth from the model,
-    if any.
+    if any · ``time`` (N,), sensings since the start.
     """
 
     truth: Array
     measurement: Array
     departure: Array | None
+    time: NDArray[Any]
 
 
 class NormalPlant(Plant[Truth]):
@@ -44,7 +45,7 @@ class NormalPlant(Plant[Truth]):
         self, measurement: Array, mean: Array, covariance: Array, noise: Array, time: Array
     ) -> Truth:
         """Draw the truth from N(mean, covariance)."""
-        return Truth(linalg.draw_normal(mean, covariance, noise), measurement, None)
+        return Truth(linalg.draw_normal(mean, covariance, noise), measurement, None, time)
 
 
 @dataclass(slots=True)

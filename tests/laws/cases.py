@@ -35,6 +35,12 @@ NOISY: Options = {
     "true_measurement_noise": 2.0,
     "memory": True,
 }
+VARYING: Options = {
+    "transition": [[[1.0, 0.1], [0.0, 1.0]], [[0.9, 0.2], [-0.1, 0.8]], [[1.0, 0.0], [0.1, 0.9]]],
+    "process_covariance": [[[0.1, 0.0], [0.0, 0.2]], [[0.0, 0.0], [0.0, 0.4]], [[0.2, 0.2]] * 2],
+    "measurement_matrices": [[[1, 0], [1, 1], [0, 2]], [[0, 1], [0, 1], [1, 0]]],
+    "measurement_covariances": [[0.2, 0.3, 0.4], [0.5, 0.1, 0.3]],
+}
 PAIRS: Options = {"access": "assignment", "channels": 2}
 QUALITY = ((0.1, 0.8), (0.7, 0.2), (0.4, 0.5))
 # Options that every environment has.
@@ -130,12 +136,16 @@ NETWORKS: dict[str, list[Options]] = {
         {"delay": 2},
         {"budget": "sensor", "harvest": "bernoulli", "memory": True} | SCARCE,
         PAIRS | {"channel": "independent", "drop_probability": QUALITY, "memory": True},
+        {"schedule": {"process_variance": (0.1, 0.3, 0.2), "end": "hold"}, "memory": True},
+        {"fusion": "ci", "memory": True},
     ],
     "LinearFusion": [
         {"access": "collision", "channel": "independent", "memory": True},
         {"delay": (0, 2), "memory": True, "channel": "independent"},
         {"budget": "sensor", "access": "single"} | SCARCE | {"token_rate": (0.2, 0.9)},
         PAIRS | {"channel": "gilbert_elliott", "delay": (0, 1)} | SCARCE,
+        {"schedule": VARYING, "memory": True, "access": "any"} | SCARCE,
+        {"schedule": VARYING | {"end": "hold"}, "delay": (0, 2), "fusion": "sci"} | NOISY,
     ],
     "TobitOscillator": [{"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE],
     "MarkovJumpTracking": [{"channel": "independent", "acknowledgements": 0.4}],

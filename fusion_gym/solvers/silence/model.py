@@ -82,6 +82,8 @@ def _parts(task: Task) -> tuple[LinearPlant, CensoredSensors]:
         reason = "the filters must predict with the plant's own matrix"
         raise forbidden("bias_aware", False, reason, "for the bound")
     plant.nature.refuse("for the bound")
+    for part in (plant.dynamics, plant.sensors):
+        part.refuse_schedule("for the bound")
     if not _predicts(estimator.centre):
         raise ConfigurationError(
             "filter is not allowed for the bound: in silence the centre must predict, so neither "

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
+from fusion_gym.arrays import Array
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
@@ -31,8 +32,13 @@ from fusion_gym.systems.correlated.system import (
 )
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.parts import numbered_states, trigger_parameters
+from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 
 _T = 0.01  # the paper's sampling time
+_SCHEDULED = (
+    "transition", "process_gain", "process_variance", "measurement_matrices",
+    "measurement_variance", "noise_coupling",
+)  # fmt: skip
 _STRUCTURE = Structure(common="all contain the same process noise", prediction=True)
 
 
@@ -86,6 +92,12 @@ class CorrelatedTrackingOptions(PaperOptions):
     noise_scale: float | Literal["random"] = 1.0
     """Actual variances over their bounds, equation (4): a number in (0, 1]. ``"random"`` draws it
     for each episode, evenly in [0.4, 1]."""
+    schedule: Mapping[str, Any] | str | None = None
+    """Matrices that vary with the step, in place of the options of these names: a dictionary, or
+    the path of a YAML or .npz file. ``transition``, ``process_gain`` and ``process_variance`` are
+    stacks over T steps; ``measurement_matrices``, ``measurement_variance`` and ``noise_coupling``
+    have a stack for each sensor. Entry k leads from step k to k + 1, or measures at step k. After T
+    steps the stacks repeat; with ``end: hold`` the last entry stays."""
     tokens: Tokens = "unlimited"
     token_rate: ArrayLike = 3.0
     fusion: Annotated[str, _STRUCTURE.offered] = "sici"
@@ -109,18 +121,23 @@ class CorrelatedTrackingOptions(PaperOptions):
     horizon: int = 200
     cost_weight: float | Literal["random"] = 0.001
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "schedule", read_schedule(self.schedule))
+
 
 def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
-    plant, sensors = _plant_and_sensors(options)
+    plant, sensors = scheduled_parts(options, _SCHEDULED, _plant_and_sensors)
     open_loop = plant.open_loop(horizon)
     chosen = options.own_weights(plant.size)
     weights = equal_weights(open_loop) if chosen is None else chosen
     nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
     names = numbered_states(plant.size, ("position", "velocity", "acceleration"))
-    plant.warn_of_unseen_growth(sensors.measurement_matrix, names)
+    if options.schedule is None:
+        plant.warn_of_unseen_growth(sensors.measurement_matrix, names)
     if options.track_actual:
         nature.refuse("with track_actual=True")
     scale = _noise_scale(options.noise_scale)
@@ -140,8 +157,26 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     return Scenario(options, truth, estimator, weights, {"adaptive_innovation": trigger})
 
 
-def _plant_and_sensors(options: CorrelatedTrackingOptions) -> tuple[LinearPlant, CorrelatedSensors]:
-    """Return plant and sensors at the bounds; both use the same process normals."""
+def _plant_and_sensors(
+    options: CorrelatedTrackingOptions, before: CorrelatedTrackingOptions
+) -> tuple[LinearPlant, CorrelatedSensors]:
+    """Return plant and sensors at the bounds; both use the same process normals.
+
+    The sensors have the noise that has just moved the plant, by the options of the step before.
+    """
+    plant, _ = _plant(options)
+    moved, deviation = _plant(before)
+    return plant, CorrelatedSensors.create(
+        options.measurement_matrices,
+        options.measurement_variance,
+        options.noise_coupling,
+        deviation,
+        moved,
+    )
+
+
+def _plant(options: CorrelatedTrackingOptions) -> tuple[LinearPlant, Array]:
+    """Return the plant, and the deviations Q^½ of its noises."""
     size = len(validation.square("transition", options.transition))
     gain = validation.array("process_gain", options.process_gain, (size, None))
     variance = validation.positive("process_variance", options.process_variance, gain.shape[1:])
@@ -149,14 +184,7 @@ def _plant_and_sensors(options: CorrelatedTrackingOptions) -> tuple[LinearPlant,
     plant = LinearPlant.create(
         options.transition, factor @ factor.T, options.initial_mean, options.initial_covariance
     )
-    plant = replace(plant, process_factor=factor[..., None])
-    return plant, CorrelatedSensors.create(
-        options.measurement_matrices,
-        options.measurement_variance,
-        options.noise_coupling,
-        np.sqrt(variance),
-        plant,
-    )
+    return replace(plant, process_factor=factor[..., None]), np.sqrt(variance)
 
 
 def _noise_scale(value: float | str) -> float | None:

@@ -6,8 +6,9 @@ based on adaptive innovation event-triggered mechanism for uncertain networked s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import LinearPlant, Sensors
+from fusion_gym.systems.schedule import MatrixSchedule
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class CorrelatedSensors(Sensors):
     the standard deviation of η; ``coupling`` β Q^½ (sensors, m, r, 1), for w written as Q^½ times r
     standard normals. They imply the bounds ``covariance`` R_ij (sensors, sensors, m, m, 1) of two
     sensors' measurement noises and ``cross_covariance`` S_i (sensors, n, m, 1) of Γ w and a
-    measurement noise.
+    measurement noise. With a ``schedule`` all of them depend on the step.
 
     Source: adaptive_innovation, equations (2), (3), (5), (6).
     """
@@ -36,6 +38,7 @@ class CorrelatedSensors(Sensors):
     coupling: Array
     covariance: Array
     cross_covariance: Array
+    schedule: MatrixSchedule | None = None
 
     @classmethod
     def create(
@@ -96,9 +99,15 @@ class CorrelatedSensors(Sensors):
 
     def select(self, sensor: int) -> CorrelatedSensors:
         """Return one of the sensors alone."""
-        own = slice(sensor, sensor + 1)
-        parts = {name: value[own] for name, value in vars(self).items() if name != "covariance"}
-        return CorrelatedSensors(**parts, covariance=self.covariance[own, own])
+        own, schedule = slice(sensor, sensor + 1), self.schedule
+
+        def parts(values: Mapping[str, Any]) -> dict[str, Any]:
+            pairs = {"covariance": (own, own)}
+            return {name: value[pairs.get(name, own)] for name, value in values.items()}
+
+        arrays = parts({k: value for k, value in vars(self).items() if k != "schedule"})
+        changed = schedule and schedule._replace(stacks=parts(schedule.stacks))
+        return CorrelatedSensors(**arrays, schedule=changed)
 
 
 class RobustOutcomes(NamedTuple):
@@ -209,6 +218,8 @@ class JointErrorCovariance:
     @classmethod
     def create(cls, plant: LinearPlant, sensors: CorrelatedSensors) -> JointErrorCovariance:
         """Return the recursion of a plant and its sensors."""
+        for part in (plant, sensors):
+            part.refuse_schedule("with track_actual=True")
         ahead = [(1, 0), (0, 0), (0, 0), (0, 0)]
         return cls(
             plant=plant,

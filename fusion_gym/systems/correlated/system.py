@@ -26,6 +26,7 @@ from fusion_gym.core.knowledge import (
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
+from fusion_gym.fusion.several import CovarianceIntersection
 from fusion_gym.namespace import namespace, ndtr, set_at, update_at
 from fusion_gym.systems.correlated.filters import (
     CorrelatedSensors,
@@ -74,7 +75,8 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
         scale = self._scale(noise[-1])
         truth = self.dynamics.start(self.dynamics.initial_mean, scale**0.5 * noise[:-1])
         nothing = np.full((self.sensors.count, self.sensors.size, noise.shape[-1]), np.nan)
-        return CorrelatedTrackingTruth(truth, nothing, departure, scale), None
+        time = np.zeros(noise.shape[-1])
+        return CorrelatedTrackingTruth(truth, nothing, departure, time, scale), None
 
     def sense(self, state: CorrelatedTrackingTruth, noise: Array) -> CorrelatedTrackingTruth:
         """Move the plant, and measure with the same noise.
@@ -83,8 +85,10 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
         """
         actual, r = state.scale**0.5 * noise, self.dynamics.noise_channels
         process, own = true_noise(state.departure, actual[:r], actual[r:])
-        truth = self.dynamics.advance(state.truth, process, state.departure)
-        return replace(state, truth=truth, measurement=self.sensors.measure(truth, process, own))
+        truth = self.dynamics.at(state.time).advance(state.truth, process, state.departure)
+        time = state.time + 1.0
+        measurement = self.sensors.at(time).measure(truth, process, own)
+        return replace(state, truth=truth, measurement=measurement, time=time)
 
     @property
     def draw_channels(self) -> int:
@@ -97,13 +101,13 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
         """Draw the noise scale from its law, and the truth from that share of the covariance."""
         scale = self._scale(noise[-1])
         truth = linalg.draw_normal(mean, scale * covariance, noise[:-1])
-        return CorrelatedTrackingTruth(truth, measurement, None, scale)
+        return CorrelatedTrackingTruth(truth, measurement, None, time, scale)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`Plant`."""
-        matrix, deviation = self.sensors.measurement_matrix, self.sensors.deviation
-        moments = self.dynamics.second_moments(horizon)
-        return largest_ratio(moments, matrix[..., 0] / deviation), 0.0
+        every = self.sensors.each_step
+        rows = np.moveaxis(every.measurement_matrix / every.deviation[:, :, None], -1, 0)
+        return largest_ratio(self.dynamics.second_moments(horizon), rows), 0.0
 
     def _scale(self, noise: Array) -> Array:
         """Return noise scales (N,) from standard normals (N,)."""
@@ -117,12 +121,14 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
 class CorrelatedTrackingEstimate(Deliveries):
     """The estimates of N runs at one time; n states, l sensors, m channels.
 
-    Estimate 0 is the fused one and estimate i is node i's. ``prior_mean`` (l + 1, n, N),
+    Estimate 0 is the fused one and estimate i is node i's. ``time`` (N,), the step in the episode ·
+    ``prior_mean`` (l + 1, n, N),
     ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``outcomes`` at
     the nodes · ``means`` (l + 1, n, N), ``covariances`` (l + 1, n, n, N), posteriors · ``joint``
     (l + 1, l + 1, n, n, N), the bound of the errors' covariances, if tracked.
     """
 
+    time: Array
     prior_mean: Array
     prior_covariance: Array
     expected: Array
@@ -149,9 +155,22 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
     noise_scale: float
     joint: JointErrorCovariance | None = None
     signals = SIGNALS
-    covariance_fields = ("prior_covariance", "covariances", "joint")
     independent_nodes = True
-    covariance_cycle = 1  # the recursion of the covariances does not depend on time
+
+    @property
+    def covariance_fields(self) -> tuple[str, ...]:  # type: ignore[override]
+        """See :class:`Estimator`; with a schedule runs at different steps differ.
+
+        Covariance intersection of several searches in each run.
+        """
+        if self.covariance_cycle is None or isinstance(self.fusion, CovarianceIntersection):
+            return ()
+        return "prior_covariance", "covariances", "joint"
+
+    @property
+    def covariance_cycle(self) -> int | None:  # type: ignore[override]
+        """See :class:`Estimator`; actual covariances need constant matrices."""
+        return 1 if self.model.period == self.filter.sensors.period == 1 else None
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -196,6 +215,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
             measurement=expected,
             held=expected,
             age=np.zeros((nodes, runs)),
+            time=np.zeros(runs),
             prior_mean=mean,
             prior_covariance=covariance,
             expected=expected,
@@ -210,17 +230,20 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
 
         Source: adaptive_innovation, equations (12), (40), (52).
         """
-        prior_mean, prior_covariance = self.model.predict(state.means, state.covariances)
+        time = state.time + 1.0
+        model, filters = self.model.at(state.time), self._filters(time)
+        prior_mean, prior_covariance = model.predict(state.means, state.covariances)
         joint = state.joint
         if self.joint is not None and joint is not None:
             joint = self.joint.predict(joint)
         return replace(
             state,
             age=state.age + 1.0,
+            time=time,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
-            expected=self.filter.expect(prior_mean[1:]),
-            outcomes=self.filter.outcomes(prior_covariance[1:]),
+            expected=filters.expect(prior_mean[1:]),
+            outcomes=filters.outcomes(prior_covariance[1:]),
             joint=joint,
         )
 
@@ -340,9 +363,14 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         deviation = _deviation(sensed(state.outcomes).innovation_covariance)
         return (state.measurement - state.expected) / deviation
 
+    def _filters(self, time: Array) -> RobustKalmanFilter:
+        """Return the filters at steps (N,)."""
+        return RobustKalmanFilter(self.filter.sensors.at(time))
+
     def _fused_innovation(self, state: CorrelatedTrackingEstimate) -> Array:
-        deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))
-        return (state.measurement - self.filter.expect(state.prior_mean[0])) / deviation
+        filters = self._filters(state.time)
+        deviation = _deviation(filters.innovation_covariance(state.prior_covariance[0]))
+        return (state.measurement - filters.expect(state.prior_mean[0])) / deviation
 
     def _variance_reduction(self, state: CorrelatedTrackingEstimate) -> Array:
         reduced = [self.trace(covariance) for covariance in self.single_deliveries(state)[1]]

@@ -48,7 +48,6 @@ class MarkovJumpTruth(Truth):
     ``time`` k (N,) · ``mode`` θ (N,) · ``process_noise`` w(k) (r, N), which moves the plant next.
     """
 
-    time: Times
     mode: Modes
     process_noise: Array
 

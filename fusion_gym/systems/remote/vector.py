@@ -172,7 +172,7 @@ class VectorSources(NormalPlant):
         count, runs, xp = self.sensor_count, noise.shape[-1], namespace(noise)
         drawn = linalg.matvec(linalg.root(self.posterior), noise.reshape(count, -1, runs))
         nothing = xp.zeros((count, self.measurement_matrix.shape[1], runs))
-        return Truth(self.flat(drawn), nothing, departure), None
+        return Truth(self.flat(drawn), nothing, departure, np.zeros(runs)), None
 
     def sense(self, state: Truth, noise: Array) -> Truth:
         """Move the sources, and measure."""
@@ -186,7 +186,7 @@ class VectorSources(NormalPlant):
         truth = moved + linalg.matvec(self.process_factor, process)
         seen = linalg.matvec(self.measurement_matrix, truth)
         measurement = seen + linalg.matvec(self.noise_factor, own)
-        return Truth(self.flat(truth), measurement, state.departure)
+        return Truth(self.flat(truth), measurement, state.departure, state.time + 1.0)
 
     def blocks(self, values: Array) -> Array:
         """Return values (n, N) of the states by source (l, s, N)."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,6 +64,14 @@ class Centre(Protocol):
         """The sensors."""
         sensors: CensoredSensors = self.filter.sensors
         return sensors
+
+    def at(self, step: Array) -> Self:
+        """Return the centre with the matrices of its sensors at steps (N,)."""
+        own: Any = self
+        sensors = self.sensors.at(step)
+        if sensors is self.sensors:
+            return self
+        return cast(Self, replace(own, filter=replace(self.filter, sensors=sensors)))
 
     @property
     def predictable(self) -> bool:
@@ -252,9 +260,9 @@ class FederatedCentre(NodeCentre):
         deviation = _deviation(sensors, expectation, linalg.total(observed * observed))
         if weight is not None:
             # Both sides times √Z, so that weight 0 is no exception.
-            scale = ((weight / (1.0 + weight * sensors.variance[..., 0])) ** 0.5)[..., None, None]
+            scale = (weight[:, None] / (1.0 + weight[:, None] * sensors.variance)) ** 0.5
             nothing = 0.0 * expectation.value
-            _, silent = joint_update(_stack(scale * observed), _stack(nothing))
+            _, silent = joint_update(_stack(scale[:, :, None] * observed), _stack(nothing))
             root = linalg.matmul(root, linalg.root(silent))
         return CentrePrediction(expectation, deviation, root)
 

@@ -220,6 +220,8 @@ def hold_centre(sensors: CensoredSensors, plant: LinearPlant) -> HoldCentre:
     Raises:
         ConfigurationError: censored sensors, or sensors that do not determine the state.
     """
+    for part in (plant, sensors):
+        part.refuse_schedule("with filter='hold'")
     rank = int(np.linalg.matrix_rank(_unit_free(sensors)[0]))
     if rank < plant.size:
         raise ConfigurationError(
@@ -310,7 +312,7 @@ class TruncatedCentre(FederatedCentre):
         """
         sensors = self.sensors
         matrix = linalg.matmul(sensors.stacked_matrix, root)
-        noise = sensors.variance.reshape(-1, 1)
+        noise = sensors.variance.reshape(sensors.noise_channels, -1)
         threshold = np.repeat(self.silence.threshold, sensors.size, axis=0)
         middle, silent = shift.reshape(noise.shape[0], -1), np.repeat(silent, sensors.size, axis=0)
         precision = information = np.zeros(silent.shape)

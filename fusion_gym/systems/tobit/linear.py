@@ -15,6 +15,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.options import Scenario, plain_options
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 from fusion_gym.systems.silence import Trigger
 from fusion_gym.systems.tobit.centres import (
     HoldCentre,
@@ -37,6 +38,9 @@ from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _JOINT = "joint_measurement_covariance"
 _HELD = "a centre that holds values cannot hold an estimate"
+_SCHEDULED = (
+    "transition", "process_covariance", "measurement_matrices", "measurement_covariances",
+)  # fmt: skip
 _STEP = 0.1  # seconds between two samples of the default target
 _REFERENCE_HORIZON = 10
 
@@ -100,7 +104,7 @@ def linear_sensors(
 
 def _matrices(value: Any, states: int) -> list[Array]:
     result = []
-    for place, item in enumerate(_each("measurement_matrices", value, "a matrix")):
+    for place, item in enumerate(validation.entries("measurement_matrices", value, "a matrix")):
         name = f"measurement_matrices[{place}]"
         row = _dimensions(item) == 1
         matrix = validation.array(name, item, (states,) if row else (None, states))
@@ -111,7 +115,11 @@ def _matrices(value: Any, states: int) -> list[Array]:
 def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
     name, count = "measurement_covariances", len(sizes)
     single = _dimensions(values) == 0
-    each = [values] * count if single else _each(name, values, "a covariance or a variance", count)
+    each = (
+        [values] * count
+        if single
+        else validation.entries(name, values, "a covariance or a variance", count=count)
+    )
     result = []
     for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
         full = name if single else f"{name}[{place}]"
@@ -124,21 +132,16 @@ def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
 def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
     """Return limits (sensors, m); absent channels have the limit ``none``."""
     item = _dimensions(values) == 0
-    each = [values] * len(sizes) if item else _each(name, values, "a number or a list", len(sizes))
+    each = (
+        [values] * len(sizes)
+        if item
+        else validation.entries(name, values, "a number or a list", count=len(sizes))
+    )
     result = np.full((len(sizes), max(sizes)), none)
     for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
         full = name if item else f"{name}[{place}]"
         result[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
     return result
-
-
-def _each(name: str, value: Any, kind: str, count: int | None = None) -> list[Any]:
-    """Return the entry of each sensor."""
-    listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim > 0)
-    if not listed or not len(value) or (count is not None and len(value) != count):
-        many = "each sensor" if count is None else f"each of the {count} sensors"
-        raise validation.refusal(name, value, f"a list with {kind} for {many}")
-    return list(value)
 
 
 def _dimensions(value: Any) -> int:
@@ -159,7 +162,7 @@ _FILTERS = {
     "joint": Filter(JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False),
     "hold": Filter(
         HoldCentre,
-        lambda options, sensors: hold_centre(sensors, _plant(options)),
+        lambda options, sensors: hold_centre(sensors, _system(options)[0]),
         nodes=False,
     ),
     "truncated": Filter(
@@ -229,6 +232,13 @@ class LinearFusionOptions(FeedbackOptions):
     """Lower limit τ: one number, one per sensor, or a list for each sensor with one per channel."""
     censoring_upper: ArrayLike | Sequence[ArrayLike] = np.inf
     """Upper limit υ: one number, one per sensor, or a list for each sensor with one per channel."""
+    schedule: Mapping[str, Any] | str | None = None
+    """Matrices that vary with the step, in place of the options of these names: a dictionary, or
+    the path of a YAML or .npz file. ``transition`` and ``process_covariance`` are stacks (T, n, n);
+    ``measurement_matrices`` and ``measurement_covariances`` have a stack for each sensor, (T, m, n)
+    or (T, n), and (T, m, m) or (T,). Entry k leads from step k to k + 1, or measures at step k.
+    After T steps the stacks repeat; with ``end: hold`` the last entry stays. Observed differences
+    are relative to the noise of step 0."""
     reward_scale: float | Literal["auto"] | None = "auto"
     cost_weight: float | Literal["random"] = 0.5
     token_rate: ArrayLike = 1.0
@@ -248,6 +258,10 @@ class LinearFusionOptions(FeedbackOptions):
     """Threshold or reportable change of the policy ``trigger``: one number, or one per sensor, in
     the unit of the measurement."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "schedule", read_schedule(self.schedule))
+
     def nominal(self) -> LinearFusionOptions:
         """Return the options whose simulation scales the reward, equal for all filters."""
         own = ("filter", "fusion", "information_shares", "order", "stochastic_weight", "trigger")
@@ -258,8 +272,7 @@ class LinearFusionOptions(FeedbackOptions):
 def build_linear(choice: LinearFusionOptions) -> Scenario:
     """Return the scenario of these options."""
     validation.horizon(choice.horizon)
-    plant = _plant(choice)
-    sensors = _sensors(choice, plant.size)
+    plant, sensors = _system(choice)
     correlated = sensors.noise_correlation is not None
     if choice.filter is None:
         default = "joint" if correlated else "kalman"
@@ -283,6 +296,16 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     if isinstance(centre, TruncatedCentre):
         scenario.policy_defaults.update(centre.silence.policy_defaults)
     return scenario
+
+
+def _system(options: LinearFusionOptions) -> Sequence[Any]:
+    """Return plant and sensors."""
+    return scheduled_parts(options, _SCHEDULED, _parts)
+
+
+def _parts(options: LinearFusionOptions, _: object) -> tuple[LinearPlant, CensoredSensors]:
+    plant = _plant(options)
+    return plant, _sensors(options, plant.size)
 
 
 def _plant(options: LinearFusionOptions) -> LinearPlant:

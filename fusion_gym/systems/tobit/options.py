@@ -129,7 +129,8 @@ def feedback_scenario(
     absent = ("true_threshold_shift",) if sensors.unlimited else ()
     nature = Nature.create(options, (*plant.unmoved, *absent))
     nature.check_growth(plant.true_radius, options.horizon)
-    plant.warn_of_unseen_growth(sensors.stacked_matrix, state_names)
+    if plant.schedule is None and sensors.schedule is None:
+        plant.warn_of_unseen_growth(sensors.stacked_matrix, state_names)
     estimator = CensoredEstimator(
         model=plant if model is None else model,
         centre=centre,

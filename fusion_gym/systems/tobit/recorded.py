@@ -221,6 +221,8 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     truth, memory = scenario.plant, cast(Any, scenario.memory_estimator)
     assert isinstance(truth, CensoredPlant)
     plant = truth.dynamics
+    for fitted_part in (plant, truth.sensors):
+        fitted_part.refuse_schedule("with a recording")
     if choice.source != "normal":
         truth.nature.refuse("with a recording", "the truth is the recording")
     count, order = truth.sensor_count, plant.size // truth.sensor_count

@@ -14,6 +14,7 @@ from fusion_gym.core.nature import true_limits
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.linear_plant import Sensors
+from fusion_gym.systems.schedule import MatrixSchedule
 
 _RIDGE = 4e-15  # relative, for each state: twice what linalg.root takes for rounding
 _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in its rounding
@@ -28,7 +29,8 @@ class CensoredSensors(Sensors):
     minus infinity, which ``finite_threshold`` replaces by zero; ``two_sided`` says whether any
     upper threshold is finite, and ``finite_upper`` replaces infinite ones by zero.
     ``noise_correlation`` is a factor L of the noises' correlations L Lᵀ, over the channels of all
-    sensors in their order; ``None`` for independent noises.
+    sensors in their order; ``None`` for independent noises. With a ``schedule`` C and R depend on
+    the step.
 
     Shapes: ``measurement_matrix`` C (sensors, m, n, 1), ``variance`` R (sensors, m, 1),
     ``threshold`` τ and ``upper`` υ (sensors, m, 1), in the unit of the measurement, infinite where
@@ -48,6 +50,7 @@ class CensoredSensors(Sensors):
     finite_upper: Array
     two_sided: bool
     noise_correlation: Array | None = None
+    schedule: MatrixSchedule | None = None
 
     @classmethod
     def create(
@@ -130,7 +133,7 @@ class CensoredSensors(Sensors):
 
         The noise of an absent component is independent, of variance 1.
         """
-        deviation = self.deviation.reshape(-1, 1, 1)
+        deviation = self.deviation.reshape(self.noise_channels, 1, -1)
         factor = self.noise_correlation
         return deviation * (linalg.identity(len(deviation)) if factor is None else factor)
 
@@ -155,7 +158,7 @@ class CensoredSensors(Sensors):
         observed = information > 0.0
         xp = namespace(information)
         values = 1.0 / xp.where(observed, information, np.inf)
-        return xp.where(observed, values, xp.where(observed.any(), values.max(), np.inf))
+        return xp.where(observed, values, xp.where(observed.any(0), values.max(0), np.inf))
 
     def regular(self, covariance: Array) -> Array:
         """Return a regular bound of the covariance (n, n, N), larger by its rounding.

@@ -7,6 +7,7 @@ round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
@@ -61,10 +62,12 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
         """Lowest and highest uncensored value of states, by their number, for pictures.
 
         It covers states that a sensor measures separately; the widest interval where sensors
-        differ.
+        differ. It is empty for sensors with a schedule.
         """
         result: dict[int, tuple[float, float]] = {}
         sensors = self.sensors
+        if sensors.schedule is not None:
+            return result
         rows = sensors.measurement_matrix[..., 0].reshape(-1, self.dynamics.size)
         limits = zip(sensors.threshold.ravel(), sensors.upper.ravel(), strict=True)
         for row, (low, high) in zip(rows, limits, strict=True):
@@ -87,30 +90,34 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
             mean = xp.sqrt(linalg.dot(mean, mean)) * direction
         truth = self.dynamics.start(mean, noise[n : 2 * n])
         own = true_noise(departure, noise[:0], noise[2 * n :])[1]
-        measurement = self.sensors.measure(truth, own, departure)
-        return Truth(truth, measurement, departure), mean
+        time = xp.zeros(runs)
+        measurement = self.sensors.at(time).measure(truth, own, departure)
+        return Truth(truth, measurement, departure, time), mean
 
     def sense(self, state: Truth, noise: Array) -> Truth:
         """Move the plant, and measure.
 
         Source: tobit_token_bucket, equations (1) and (2).
         """
-        r, departure = self.dynamics.noise_channels, state.departure
+        r, departure, time = self.dynamics.noise_channels, state.departure, state.time + 1.0
         process, own = true_noise(departure, noise[:r], noise[r:])
-        truth = self.dynamics.advance(state.truth, process, departure)
-        measurement = self.sensors.measure(truth, own, departure)
-        return Truth(truth, measurement, departure)
+        truth = self.dynamics.at(state.time).advance(state.truth, process, departure)
+        measurement = self.sensors.at(time).measure(truth, own, departure)
+        return Truth(truth, measurement, departure, time)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`Plant`."""
-        sensors, size = self.sensors, self.dynamics.size
-        matrix, noise = sensors.measurement_matrix[..., 0], sensors.noise_covariance[..., 0]
+        every = self.sensors.each_step
+        rows = np.moveaxis(every.measurement_matrix / every.deviation[:, :, None], -1, 0)
         moments = self.dynamics.second_moments(horizon, self.random_start)
-        signal = largest_ratio(moments, matrix / sensors.deviation)
-        own = sensors.variance * np.eye(sensors.size)  # of single packets, then of all together
-        groups = ((matrix, own), (matrix.reshape(-1, size), noise))
-        loss = max(variance_loss(self.dynamics, horizon, *group) for group in groups)
-        return signal, loss
+        loss = variance_loss(self.dynamics, horizon, self._packets)
+        return largest_ratio(moments, rows), loss
+
+    def _packets(self, time: int) -> Iterator[tuple[Array, Array]]:
+        """Yield matrices and noises of the single packets of a time, then of all together."""
+        sensors = self.sensors.at(np.full(1, time))
+        yield sensors.measurement_matrix[..., 0], sensors.variance * np.eye(sensors.size)
+        yield sensors.stacked_matrix[..., 0], sensors.noise_covariance[..., 0]
 
 
 class Announcement(NamedTuple):
@@ -214,7 +221,9 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         With federated fusion, or one filter at the centre, the covariances are then the actual ones
         if ``model`` is the plant; with covariance intersection they are bounds. Gaps have none.
         """
-        return 1 if self.centre.predictable and self.level is None else None
+        if not self.centre.predictable or self.level is not None:
+            return None
+        return max(self.model.period, self.centre.sensors.period)
 
     @property
     def state_weights(self) -> Array:
@@ -238,8 +247,10 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         """
         model, centre = self.model, self.centre
         if process_covariance is not None:
+            model.refuse_schedule("with another process covariance")
             model = replace(model, process_covariance=process_covariance[..., None])
         if measurement_variance is not None:
+            centre.sensors.refuse_schedule("with another measurement variance")
             variance = measurement_variance[..., None]
             deviation = namespace(variance).sqrt(variance)
             sensors = replace(centre.sensors, variance=variance, deviation=deviation)
@@ -310,7 +321,8 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
             first.prediction = self.centre.predict(mean, covariance, filled, first.time)
             first = self.observe(first, measurement)
             first.held = first.measurement
-        prediction = self.centre.predict(mean, covariance, first.held, first.time)
+        centre = self.centre.at(first.time)
+        prediction = centre.predict(mean, covariance, first.held, first.time)
         everyone = xp.ones((sensors.count, runs), dtype=np.bool_)
         result = self.update(replace(first, prediction=prediction), Reception(everyone))
         return replace(result, prediction=None, age=first.age)
@@ -324,7 +336,8 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         if self.level is not None:
             held = held - (self._level(state, time) - self._level(state, state.time))
             state = replace(state, held=held)
-        (prior_mean, prior_covariance), prediction = self.centre.advance(self.model, state)
+        model, centre = self.model.at(state.time), self.centre.at(time)
+        (prior_mean, prior_covariance), prediction = centre.advance(model, state)
         return replace(
             state,
             age=state.age + 1.0,
@@ -354,15 +367,17 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         arrived = reception.arrived
         if state.available is not None:
             arrived = arrived & state.available
-        mean, covariance = self.centre.update(prior, prediction, state.measurement, arrived)
+        centre = self.centre.at(state.time)
+        mean, covariance = centre.update(prior, prediction, state.measurement, arrived)
         return state.after(arrived, prediction=prediction, mean=mean, covariance=covariance)
 
     def single_deliveries(self, state: CensoredEstimate) -> tuple[Array, Array] | None:
         """See :class:`Estimator`."""
-        if not self.centre.separable:
+        centre = self.centre.at(state.time)
+        if not centre.separable:
             return None
         prior = state.prior_mean, state.prior_covariance
-        means, covariances = self.centre.single(prior, sensed(state.prediction), state.measurement)
+        means, covariances = centre.single(prior, sensed(state.prediction), state.measurement)
         if state.available is not None:
             silent = self.update(state, Reception(np.zeros_like(state.available))).covariance
             covariances = np.where(state.available[:, None, None], covariances, silent)
@@ -375,7 +390,8 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         @functools.cache
         def variances() -> tuple[Array, Array]:
             prior = state.prior_mean, state.prior_covariance
-            return self.centre.variances(prior, sensed(state.prediction), self.state_weights)
+            centre = self.centre.at(state.time)
+            return centre.variances(prior, sensed(state.prediction), self.state_weights)
 
         values: dict[str, Any] = {
             **super().read(state, failure),
@@ -416,7 +432,8 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         if state.prediction is None:
             return super().local_means(state)
         prior, arrived = (state.prior_mean, state.prior_covariance), state.age == 0.0
-        return self.centre.local_means(prior, state.prediction, state.measurement, arrived)
+        centre = self.centre.at(state.time)
+        return centre.local_means(prior, state.prediction, state.measurement, arrived)
 
 
 def _whitened(state: CensoredEstimate) -> Array:

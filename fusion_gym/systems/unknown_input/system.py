@@ -36,12 +36,10 @@ _IMAGINED = 32  # signals of which one is taken, where one is imagined
 class UnknownInputTruth(Truth):
     """The true state of N runs at one time; the truth is [x(k); d(k - 1)].
 
-    ``signal`` (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since
-    the start.
+    ``signal`` (rows, N), the memory of the input signal; a sensing is a sampling instant.
     """
 
     signal: Array
-    time: Array
 
 
 @dataclass(frozen=True)
