@@ -88,11 +88,10 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
     draw_headline(results, titles, folder / "readme.png")
     headline = headline_text(suite.settings, results.savings)
     short, long = suite.training_seeds
-    command = "make benchmark" if folder == Path("results") else "python -m agents.benchmark"
     named = {kind for setting in suite.settings for kind in setting.named_rules}
     page = [
-        "# Benchmark",
-        f"Results of `{command}` in version {__version__}: {suite.episodes:,} test episodes, "
+        f"# {suite.title}",
+        f"Results of `{suite.command}` in version {__version__}: {suite.episodes:,} test episodes, "
         f"{long} trainings of an agent, {short} where one takes less than a minute. "
         f"[Method]({'../' * len(folder.parts)}docs/benchmark.md).",
         headline,

@@ -110,6 +110,8 @@ class Suite(Strict):
     ``training_seeds`` are the numbers of short trainings and of others.
     """
 
+    title: str
+    command: str
     episodes: Positive
     tuning_episodes: tuple[Positive, Positive]
     calibration_episodes: tuple[Positive, Positive]
