@@ -228,7 +228,7 @@ class Recording:
         ]
         for row in (row for row in card if row.channel.name in chosen):
             counts = f"{row.spikes} spikes" * (row.spikes > 0)
-            stuck = f"{row.stuck:.1%} of the readings are stuck" * (row.stuck > 0.0)
+            stuck = f"{row.stuck:.1%} of the readings are stuck" * (row.stuck >= 0.001)
             remarks += [f"{row.channel.name}: {text}" for text in (counts, stuck) if text]
         channels = tuple(row.channel for row in card if row.channel.name in chosen)
         return Recording(values[chosen], channels, (*self.remarks, *remarks))
