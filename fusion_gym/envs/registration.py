@@ -23,8 +23,8 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.option_text import Option, list_options, options_in
 from fusion_gym.errors import forbidden, refusal
-from fusion_gym.importing import imported, name_of
-from fusion_gym.validation import ConfigurationError, read_text
+from fusion_gym.importing import imported, load_yaml, name_of
+from fusion_gym.validation import ConfigurationError
 
 Build = Callable[[Any], Scenario]
 _REHEARSED: set[tuple[Any, ...]] = set()  # inputs of tasks that passed the rehearsal
@@ -255,14 +255,11 @@ def _read_options(path: str | os.PathLike[str]) -> Options:
     """Return the options of a YAML file by name."""
     if not isinstance(path, (str, os.PathLike)):
         raise refusal("system", path, "the path of a YAML file")
-    source = f"system = {os.fspath(path)!r}"
-    try:
-        from fusion_gym.yaml_text import parsed
-    except ModuleNotFoundError:
-        raise ConfigurationError(f"{source} needs PyYAML: pip install pyyaml") from None
-    content = parsed(read_text("system", Path(path)), source)
+    content = load_yaml("system", Path(path))
     if not (isinstance(content, dict) and all(isinstance(key, str) for key in content)):
-        raise ConfigurationError(f"{source} is not allowed: it must hold a mapping of options")
+        raise ConfigurationError(
+            f"system = {os.fspath(path)!r} is not allowed: it must hold a mapping of options"
+        )
     return content
 
 

@@ -14,8 +14,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import CommonOptions, plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
+from fusion_gym.importing import load_yaml
 from fusion_gym.namespace import namespace, take
-from fusion_gym.yaml_text import parsed
 
 _NAME, _END = "schedule", "end"
 _ENDS = ("repeat", "hold")
@@ -79,7 +79,7 @@ def read_schedule(value: Any) -> dict[str, Any] | None:
     """
     path = Path(value if isinstance(value, str) else "")
     if path.suffix in (".yaml", ".yml"):
-        value = parsed(validation.read_text(_NAME, path), value)
+        value = load_yaml(_NAME, path)
     elif path.suffix == ".npz":
         try:
             with np.lib.npyio.NpzFile(path.open("rb"), own_fid=True) as arrays:

@@ -17,12 +17,12 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.options import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
-from fusion_gym.importing import require
+from fusion_gym.importing import load_yaml, require
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import Truth
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
 from fusion_gym.systems.tobit.system import Announcement, CensoredPlant, DailyLevel
-from fusion_gym.validation import number, read_text
+from fusion_gym.validation import number
 
 _EXAMPLE = ("transition", "process_covariance", "initial_covariance", "measurement_matrices",
             "measurement_covariances", "state_names", "joint_measurement_covariance")  # fmt: skip
@@ -261,14 +261,11 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
 
 def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:
     """Return the options with the made-up log and its plant."""
-    from fusion_gym.yaml_text import parsed
-
     folder = Path(str(files("fusion_gym.recordings")))
     for name in _EXAMPLE:
         if getattr(choice, name) is not getattr(LinearFusionOptions, name):
             raise refusal(name, getattr(choice, name), "left out without a log")
-    path = folder / "tanks.yaml"
-    options = parsed(read_text("system", path), str(path))
+    options = load_yaml("system", folder / "tanks.yaml")
     if choice.state_weights is not None:
         options["state_weights"] = choice.state_weights
     return replace(choice, log="tanks", **options)
