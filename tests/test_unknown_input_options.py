@@ -120,6 +120,8 @@ DRIFTING = (((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 1.0, 0.0)),) * 3
             "process_covariance = .* have an input",
         ),
         ({"input_signal": np.ones((101, 1)), "input_period": 3.0}, "input_period = 3.0"),
+        (shape(2, 2, 2, 2) | {"input_amplitude": [0.1, 0.1]}, r"input_amplitude .* \(2, terms\)"),
+        ({"intersample_error": True, "error": "trace"}, "error = 'trace' .* intersample_error"),
         ({"input_signal": "steps", "input_period": 0.5}, r"input_period .* >= 1"),
         ({"input_signal": "steps", "input_phase": 0.0}, "input_phase = 0.0"),
     ],
@@ -140,3 +142,37 @@ def test_given_numbers_go_before_the_examples() -> None:
     assert task.settings["filter"] == "paper"
     assert task.plant.state_names == ("x1", "x2", "d1", "d2")
     assert build().plant.state_names[-1] == "force"
+
+
+def test_the_error_between_samples_is_of_the_predicted_small_steps() -> None:
+    options = shape(3, 2, 2, 2) | {"sampling_period": 4, "intersample_error": True}
+    task = build(**options, state_weights=[1.0, 2.0, 0.5, 3.0, 0.0], error_weight=2.0)
+    batch = EpisodeBatch.seeded(task, 4, 0)
+    outcome = batch.step(np.array([[True, False, True, False]] * 2))
+    weights, (states, inputs) = task.reward.state_weights[:, 0], np.split(outcome.error, [3])
+    cost = np.zeros(4)
+    for run in range(4):
+        for small in range(4):  # in closed form: Aʲ e + Σ Aⁱ B e_d
+            power = partial(np.linalg.matrix_power, np.array(options["transition"]))
+            error = power(small) @ states[:, run]
+            error += sum(power(i) @ options["input_matrix"] @ inputs[:, run] for i in range(small))
+            cost[run] += weights[:3] @ error**2 / 4
+        cost[run] += weights[3:] @ inputs[:, run] ** 2
+    np.testing.assert_allclose(outcome.reward_error, -2.0 * cost, rtol=1e-12)
+
+
+def test_the_variance_of_a_silent_node_is_its_prediction() -> None:
+    batch = EpisodeBatch.seeded(build(), 2, 0)
+    plant: Any = batch.task.plant
+    a, b = plant.dynamics.transition[..., 0], plant.dynamics.input_matrix[..., 0]
+    memory, change, deviation = 0.9, 0.3, 0.7  # r and η of d(k) = r d(k-1) + η, and d's own
+    move = np.block([[a, memory * b], [np.zeros((1, 4)), np.full((1, 1), memory)]])
+    new = np.vstack((b, [[1.0]])) * change
+    noise = new @ new.T
+    noise[:4, :4] += plant.dynamics.process_covariance[..., 0]
+    covariance = np.diag([0.1] * 4 + [deviation**2])
+    for _ in range(6):
+        covariance = move @ covariance @ move.T + noise
+        expected = np.full((3, 2), np.trace(covariance[:4, :4]))
+        np.testing.assert_allclose(batch.signals()["local_variance"], expected, rtol=1e-9)
+        batch.step(np.zeros((3, 2), dtype=np.bool_))

@@ -132,6 +132,16 @@ _COMMON_AXES = {
 }
 
 
+# Of estimators whose nodes have their own estimates.
+LOCAL_VARIANCE = Signal(
+    "local_variance",
+    "centre",
+    "(sensors, N)",
+    "plain trace of the covariance of the node's state before a packet",
+    "own",
+)
+
+
 def common_signals(axes: str = "(sensors, m, N)", **meanings: str) -> tuple[Signal, ...]:
     """Return the signals that every estimator offers.
 

@@ -252,6 +252,7 @@ class Scenario:
         no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
         required_policy: The policy whose silence the filter reads, or ``None``.
         noise: Source of the plant's noise; ``None`` draws standard normals.
+        error: Function of errors and covariances in place of the option ``error``.
 
     Example:
         >>> import fusion_gym
@@ -273,6 +274,7 @@ class Scenario:
     no_estimates: str | None = None
     required_policy: str | None = None
     noise: NoiseSource | None = None
+    error: Callable[[Array, Array], Any] | None = None
 
 
 def plain_options(value: Any) -> Any:

@@ -193,7 +193,7 @@ class Task:
             ratios = np.ones(()) if weights is None else weights
             weights = factor * validation.not_negative("state_weights", ratios, open_loop.shape)
         reward = Reward.create(
-            options.error,
+            options.error if scenario.error is None else scenario.error,
             options.error_weight,
             Price.create(options.cost_weight, options.price_range),
             weights,

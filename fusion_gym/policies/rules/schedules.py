@@ -226,7 +226,8 @@ class LocalVariance(Rule):
 
     Args:
         m: distance to the reference, in squared units of the state, of any sign.
-        reference: trace of the fusion of all nodes at full rate, by default from the environment.
+        reference: trace of the fusion of all nodes at full rate, by default from
+            MarkovJumpTracking, and 0 elsewhere.
 
     Equation:
         $$

@@ -16,6 +16,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import (
+    LOCAL_VARIANCE,
     Block,
     age_block,
     common_signals,
@@ -138,7 +139,10 @@ class CorrelatedTrackingEstimate(Deliveries):
     joint: Array | None
 
 
-SIGNALS = common_signals(prior_covariance="conservative covariance of the prediction")
+SIGNALS = (
+    *common_signals(prior_covariance="conservative covariance of the prediction"),
+    LOCAL_VARIANCE,
+)
 
 
 @dataclass(frozen=True)
@@ -284,6 +288,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
             "prior_covariance": state.prior_covariance[0],
             "silent_variance": lambda: self.trace(state.prior_covariance[0]),
             "variance_reduction": lambda: self._variance_reduction(state),
+            "local_variance": lambda: linalg.trace(state.prior_covariance[1:]),
         }
 
     def single_deliveries(self, state: CorrelatedTrackingEstimate) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import (
+    LOCAL_VARIANCE,
     Block,
     Signal,
     age_block,
@@ -177,7 +178,7 @@ SIGNALS = (
         expected_measurement="the centre's copy, predicted",
     ),
     *OF_FAMILY,
-    Signal("local_variance", "centre", _PER_SENSOR, "plain trace of the node's covariance", "own"),
+    LOCAL_VARIANCE,
 )
 
 

@@ -20,7 +20,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.admission import LARGEST_ERROR
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import PaperOptions, Scenario, Tokens
-from fusion_gym.errors import forbidden
+from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.unknown_input import filters, signals
@@ -177,8 +177,8 @@ class UnknownInputOptions(PaperOptions):
     ``"random_walk"`` reverts to its mean with the correlation time period. An array
     (horizon + 1, q) is the same in every episode."""
     input_amplitude: ArrayLike | None = None
-    """Amplitudes of the sinusoids: one number, (terms,) or (q, terms). Of steps and random walk:
-    the standard deviation, one number, or one per input."""
+    """Amplitudes of the sinusoids: one number, (q, terms), or (terms,) with one input. Of steps and
+    random walk: the standard deviation, one number, or one per input."""
     input_period: ArrayLike | None = None
     """Period in sampling instants, in the shape of the amplitude."""
     input_phase: ArrayLike | str | None = None
@@ -217,6 +217,9 @@ class UnknownInputOptions(PaperOptions):
     tokens: Tokens = "unlimited"
     input_weight: float = 1.0
     """Weight of an input's error in the reward, where a state's is 1."""
+    intersample_error: bool = False
+    """Reward the states' mean squared error over the a small steps from each sampling instant. The
+    centre predicts them from its estimates of state and input; process noise is left out."""
 
 
 def build_unknown(choice: UnknownInputOptions) -> Scenario:
@@ -265,10 +268,31 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
         truth,
         estimator,
         weights,
-        {"adaptive_threshold": trigger},
+        policy_defaults={"adaptive_threshold": trigger},
+        error=_intersample(options, weights),
         memory_estimator=memory,
         no_estimates="the centre computes each estimate from the packets of the nodes",
     )
+
+
+def _intersample(options: Any, weights: Array) -> Any:
+    """Return the cost of the errors of the small steps x' = A x + B d, ``None`` if not chosen."""
+    if not options.intersample_error:
+        return None
+    if options.error != "squared":
+        raise refusal("error", options.error, "'squared'", "with intersample_error=True")
+    if options.reward_scale is not None:
+        weights = options.reward_scale * weights
+    small, inputs = np.asarray(options.transition), np.asarray(options.input_matrix)
+    steps, size = [np.eye(len(small), len(weights))], len(small)
+    for _ in range(1, options.sampling_period):
+        steps.append(small @ steps[-1] + np.pad(inputs, ((0, 0), (size, 0))))
+
+    def cost(error: Array, covariance: Array) -> Array:
+        states = np.square(np.array(steps) @ error).mean(0)
+        return weights @ np.concatenate((states, np.square(error[size:])))
+
+    return cost
 
 
 def _with_example(options: UnknownInputOptions) -> Any:
@@ -291,7 +315,7 @@ def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> signals.
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
-                raise validation.refusal(name, value, "None", "with an array as input_signal")
+                raise refusal(name, value, "None", "with an array as input_signal")
         return signals.ArrayInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
     if kind == "sinusoids":

@@ -76,7 +76,7 @@ class Sinusoids(InputSignal):
     def create(
         cls, size: int, amplitude: ArrayLike, period: ArrayLike, phase: ArrayLike | str = "random"
     ) -> Sinusoids:
-        """Return the signal of numbers for all, (terms,) for all inputs, or (size, terms).
+        """Return the signal of numbers for all, (terms,) for one input, or (size, terms).
 
         Args:
             size: number of inputs q.
@@ -90,6 +90,10 @@ class Sinusoids(InputSignal):
         random = isinstance(phase, str)
         if random and phase != "random":
             raise validation.refusal("input_phase", phase, "'random' or radians")
+        for name, value in {"amplitude": amplitude, "period": period, "phase": phase}.items():
+            if size > 1 and np.ndim(value) == 1:
+                allowed = f"one number, or ({size}, terms) numbers"
+                raise validation.refusal(f"input_{name}", value, allowed, f"with {size} inputs")
         shape = (size, _terms(amplitude, period, 0.0 if random else phase))
         return cls(
             size,

@@ -14,6 +14,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import (
+    LOCAL_VARIANCE,
     Block,
     age_block,
     common_signals,
@@ -167,11 +168,14 @@ class UnknownInputEstimate(Deliveries):
     prediction: NodePrediction | None
 
 
-SIGNALS = common_signals(
-    age="sampling instants since the last delivery",
-    expected_measurement="the node's expectation, with the predicted input",
-    prior_mean="prediction of the fused state",
-    prior_covariance="covariance of the prediction, with zero blocks between state and input",
+SIGNALS = (
+    LOCAL_VARIANCE,
+    *common_signals(
+        age="sampling instants since the last delivery",
+        expected_measurement="the node's expectation, with the predicted input",
+        prior_mean="prediction of the fused state",
+        prior_covariance="covariance of the prediction, with zero blocks between state and input",
+    ),
 )
 
 
@@ -273,6 +277,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
             "prior_covariance": lambda: _lanes(self._fused_prior(state), len(state.time)),
             "silent_variance": lambda: variances()[0],
             "variance_reduction": lambda: variances()[1],
+            "local_variance": lambda: self._local_variance(state),
         }
 
     def mean(self, state: UnknownInputEstimate) -> Array:
@@ -314,6 +319,11 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
     def _log_deviation(self, state: UnknownInputEstimate) -> Array:
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
         return _lanes(log_deviation(before, self.reference), len(state.time))
+
+    def _local_variance(self, state: UnknownInputEstimate) -> Array:
+        n = self.nodes.model.size
+        prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
+        return _lanes(linalg.trace(prior[:, :n, :n]), len(state.time))
 
     def _fused_prior(self, state: UnknownInputEstimate) -> Array:
         n = self.nodes.model.size
