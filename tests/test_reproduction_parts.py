@@ -2,19 +2,21 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.optimize import minimize_scalar
 
 import fusion_gym
+from agents.papers import adaptive_innovation, markov_jump, unknown_input
 from agents.papers import round_robin_tobit_runs as biased
 from agents.papers import tobit_token_bucket_runs as runs
-from agents.papers import unknown_input
-from agents.papers.adaptive_innovation_runs import _largest, _whitened
+from agents.papers.adaptive_innovation_runs import Lane, TriggerReading, _largest, _whitened, steps
 from agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
-from agents.papers.markov_jump_covariances import covariances
+from agents.papers.markov_jump_covariances import covariances, iterated_gap
 from agents.papers.numbers import (
     DEPENDS,
     FAILS,
@@ -35,6 +37,7 @@ from agents.papers.walk import SomeSensors
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.metrics import Interval
+from fusion_gym.validation import ConfigurationError
 
 SEED = 1_000_000
 
@@ -300,6 +303,41 @@ def test_printed_recursion_is_exact_where_its_third_term_is_put_right() -> None:
     assert np.linalg.eigvalsh(printed).min() < -1.0
 
 
+@pytest.mark.parametrize("name", list(markov_jump.READINGS)[1:])
+def test_references_of_the_readings_are_the_traces_of_the_fused_covariance(name: str) -> None:
+    estimator = example().estimator
+    filters, reading = estimator.filters, markov_jump.READINGS[name]  # type: ignore[attr-defined]
+    traces = estimator.full_rate_traces()  # type: ignore[attr-defined]
+    expected = traces.min()
+    if reading.get("augmented"):
+        local = filters.covariance[..., -6:].transpose(4, 0, 2, 1, 3).reshape(6, 12, 12)
+        every = np.tile(np.eye(4), (3, 1))
+        best = np.linalg.inv(every.T @ np.linalg.solve(local, every[None]))
+        expected = np.trace(best, axis1=1, axis2=2).mean()
+    assert reading["reference"] == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("node", [0, 1, 2])
+def test_iterated_synchronisation_differs_from_another_covariance(node: int) -> None:
+    estimator = example().estimator
+    assert iterated_gap(estimator, node, 60) < 1e-12
+    filters = estimator.filters  # type: ignore[attr-defined]
+    other = replace(filters, covariance=1.01 * filters.covariance)
+    changed = replace(estimator, filters=other)  # type: ignore[call-arg]
+    assert iterated_gap(changed, node, 60) == pytest.approx(0.01 / 1.01)
+
+
+def test_traces_of_the_augmented_state_are_the_triggers() -> None:
+    settings = markov_jump.PAPER.settings({"augmented": True, "reference": 3.1346})
+    task = markov_jump.read_example(settings, horizon=60)
+    covariance = task.estimator.filters.covariance  # type: ignore[attr-defined]
+    sent = run_markov_jump(task, trigger(0.9), 1, 0).sent[-6:].sum(0)
+    level = np.einsum("iiaat->it", covariance)[:, -6:] >= 3.1346 + 0.9
+    assert sent.tolist() == level.sum(1).tolist() == [0, 6, 6]
+    own = example().policy_defaults["local_variance"]["reference"]
+    assert np.einsum("iiaat->it", covariance)[:, -6:].min() > own + 1.5
+
+
 @pytest.mark.parametrize("period", [1, 4, 6])
 def test_period_is_found(period: int) -> None:
     pattern = np.random.default_rng(0).normal(size=period)
@@ -310,6 +348,83 @@ def test_period_is_found(period: int) -> None:
 
 
 # --- adaptive innovation, unknown input ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("ratios", [(1.0, 0.3, 0.0), (0.2, 1.0, 0.5), (0.5, 0.5, 0.5)])
+def test_actual_covariances_are_those_of_the_errors(ratios: tuple[float, float, float]) -> None:
+    """Of 20,000 errors of every estimate: within 5 standard errors; beside a lane at the bounds."""
+    always = lambda signals, event: np.ones_like(event)  # noqa: E731
+    lanes, settings = [Lane(rule=always), Lane(ratios, always)], adaptive_innovation.PAPER.settings
+    options = {"horizon": 6, "track_actual": True, "fusion": "sici"}
+    *_, last = steps(lanes, 20_000, 0, settings({}), **options)
+    estimate, each = last.state.estimate, np.arange(4)
+    claimed = np.stack([estimate.joint[each, each][..., place] for place in (0, -1)])
+    errors = (last.state.plant.truth - estimate.means).reshape(4, 3, 2, -1)
+    moments = np.einsum("jale,jble->ljab", errors, errors) / errors.shape[-1]
+    scale = np.sqrt(np.einsum("ljaa->lja", claimed))
+    apart = np.abs(moments - claimed) / (scale[..., None] * scale[..., None, :])
+    assert apart.max() <= 5.0 * math.sqrt(2.0 / 20_000)
+    np.testing.assert_allclose(claimed[0, 1:], estimate.covariances[1:, ..., 0], rtol=1e-9)
+
+
+def test_readings_of_the_trigger_are_their_formulas() -> None:
+    size = np.array([[0.5], [0.9]])
+    signals = {"innovation": size[:, None], "start": np.array([True]), "age": np.ones((2, 1))}
+    level = 0.6 * np.exp(-(0.2 + 0.9 * size))
+    for changes, expected in (
+        ({}, level), ({"sign": 1.0}, 0.6 * np.exp(-0.2 + 0.9 * size)),
+        ({"power": 2.0}, 0.6 * np.exp(-(0.2 + 0.9 * size**2))), ({"same_step": True}, level),
+    ):  # fmt: skip
+        rule = TriggerReading(**changes)  # type: ignore[arg-type]
+        rule.reset(1)
+        np.testing.assert_allclose(rule.threshold_after(size), expected)
+        first = level if rule.same_step else 0.6 * np.exp(-0.2)
+        np.testing.assert_array_equal(rule(signals), size**2 >= first)  # type: ignore[arg-type]
+    assert 0.6 * np.exp(-0.2) > 0.6**2 >= 0.6 * np.exp(-0.2 - 0.9 * 0.6)
+    rule = TriggerReading(same_step=True)
+    between = signals | {"innovation": np.full((2, 1, 1), 0.6)}
+    assert rule(between).all()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("fusion", adaptive_innovation.FUSIONS)
+def test_inverses_are_those_of_the_printed_formulas(fusion: str) -> None:
+    """(42) and (54) at the library's weight have its trace."""
+    inverted = []
+
+    def inverse(matrix: np.ndarray) -> np.ndarray:
+        inverted.append(matrix)
+        return np.linalg.inv(matrix)
+
+    def trace(weight: float) -> float:
+        information = inverse(first), inverse(second)
+        if fusion == "sci":
+            joint = weight * information[0] + (1.0 - weight) * information[1]
+        else:
+            joint = sum(information) - inverse(weight * first + (1.0 - weight) * second)
+        return float(np.trace(inverse(joint)))
+
+    first, second = np.diag([1.0, 4.0, 2.0]), np.diag([3.0, 1.0, 2.5])
+    trace(0.5)
+    assert len(inverted) == adaptive_innovation.INVERSES[fusion]
+    task = fusion_gym.make_task("fusion_gym/CorrelatedTracking-v1", fusion=fusion)
+    both = np.stack((first, second))[..., None]
+    rule = replace(task.estimator.fusion, order=None)  # type: ignore[attr-defined]
+    fused = rule.fuse(np.zeros((2, 3, 1)), both).covariance
+    least = minimize_scalar(trace, bounds=(0.0, 1.0), method="bounded").fun
+    assert np.trace(fused[..., 0]) == pytest.approx(least, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("paper", "changes"),
+    [
+        (adaptive_innovation, {"start_ratio": 1.1}), (adaptive_innovation, {"own_ratio": 0.0}),
+        (adaptive_innovation, {"same_step": 2}), (markov_jump, {"reference": -1.0}),
+    ],
+)  # fmt: skip
+def test_values_of_readings_are_checked(paper: Any, changes: dict[str, Any]) -> None:
+    (name,) = changes
+    with pytest.raises(ConfigurationError, match=f"{name} = "):
+        paper.PAPER.settings(changes)
 
 
 def test_a_bound_is_reported_from_what_is_none() -> None:

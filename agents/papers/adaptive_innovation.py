@@ -3,7 +3,7 @@
 Source: adaptive_innovation, Section 6.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,111 +21,81 @@ from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Sett
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.output import palette
-from fusion_gym.policies.rules.measurements import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
+from fusion_gym.validation import boolean, number
 
 STATES = ("position", "velocity", "acceleration")
 UNITS = ("m", "m/s", "m/s²")
 FUSIONS = ("sci", "sici")
 NAMES = {"sci": "SCI", "sici": "SICI"}
+INVERSES = {"sci": 3, "sici": 4}  # of matrices in (42) and (54) at a weight
 TRIGGER = "adaptive_innovation"
 PRINTED = (0.6067, 0.485, 0.7067)  # Section 6, one run
-RULE = AdaptiveInnovation()
-_A, _B, _C = (float(RULE.column(name, 1)[0, 0]) for name in ("threshold", "offset", "sensitivity"))
-OURS, PRINTED_SIGN = "our reading of the trigger", "the sign in (10) as printed, -b + c |ε|"
-FIXED, TIMED = "c = 0", "a = 0"
+TRIGGERS = OURS, PRINTED_SIGN, FIXED, TIMED = "ours", "printed_sign", "fixed", "timed"
 AT_BOUND, OTHERS, ALWAYS = "at the bounds", "requests of another episode", "always"
+# What the text leaves open; the actual variances Q̄ and σ̄_η² are of Figures 3 to 6.
+READINGS: dict[str, Settings] = {
+    "our reading": {},
+    "P̄(0) = P₀, as in (7) and (23)": {"start_ratio": 1.0},
+    "x(0) exactly at its mean": {"start_ratio": 0.0},
+    "Q̄ = 0.8 Q, σ̄_η² = 0.4 σ_η²": {"process_ratio": 0.8, "own_ratio": 0.4},
+    "l(k) = k in (10)": {"same_step": True},
+    "|ε|² in (10)": {"power": 2.0},
+}
 
 
 # --- thresholds and rates -------------------------------------------------------------------------
 
 
-class _Reading:
-    """A trigger with another threshold or another innovation; one object for each batch.
-
-    ``threshold`` is a function of the sizes |ε| at the last request and now; the rule compares it
-    with the size's ``power``.
-    """
-
-    def __init__(
-        self,
-        threshold: Callable[[Array, Array], Array],
-        innovation: Callable[[Signals], Array] | None = None,
-        power: int = 2,
-    ) -> None:
-        self.threshold, self.innovation, self.power = threshold, innovation, power
-        self.last: Array = np.zeros(1)
-
-    def __call__(self, signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        own = signals["innovation"][:, 0]
-        size = np.abs(own if self.innovation is None else self.innovation(signals))
-        last = np.broadcast_to(self.last, size.shape)
-        request = size**self.power >= self.threshold(last, size)
-        self.last = np.where(request, size, last)
-        return np.asarray(request)
+def _lane(
+    settings: Settings, scale: float | None = None, rule: runs.RequestFunction | None = None
+) -> Lane:
+    """Return a lane at a noise scale, by default at the ratios of Figures 3 to 6."""
+    process, own = settings["process_ratio"], settings["own_ratio"]
+    if scale is not None:
+        process = own = scale
+    start = settings["start_ratio"]
+    return Lane((process, own, process if start is None else start), rule)
 
 
-def _ours(last: Array, now: Array) -> Array:
-    return _A * np.exp(-(_B + _C * last))
-
-
-def _printed(last: Array, now: Array) -> Array:
-    return _A * np.exp(-_B + _C * last)
-
-
-def _against_the_centre(signals: Signals) -> Array:
-    matrix = np.array(CorrelatedTrackingOptions().measurement_matrices)[:, 0]
-    return signals["measurement"][:, 0] - matrix @ signals["prior_mean"]
-
-
-def _readings() -> dict[str, Lane]:
-    return {
-        OURS: Lane(),
-        PRINTED_SIGN: Lane(rule=_Reading(_printed)),
-        "the threshold after the innovation of the same step, l(k) = k": Lane(
-            rule=_Reading(lambda last, now: _ours(now, now))
-        ),
-        "|ε|² instead of |ε| in the exponent": Lane(
-            rule=_Reading(lambda last, now: _ours(last**2, now))
-        ),
-        "|ε| instead of |ε|² against the threshold": Lane(rule=_Reading(_ours, power=1)),
-        "ε against the fused prediction (SICI)": Lane(rule=_Reading(_ours, _against_the_centre)),
-        "x(0) exactly at its mean": Lane(known_start=True),
-        "actual variances 0.8 of the bounds": Lane(scale=0.8),
-        FIXED: Lane(rule=_Reading(lambda last, now: _ours(0.0 * last, now))),
-        TIMED: Lane(rule=_Reading(lambda last, now: 0.0 * last)),
-    }
+def _replaced(**changes: Any) -> runs.RequestFunction:
+    """Return the requests of the printed trigger with changed parameters."""
+    rule = runs.TriggerReading(**changes)
+    rule.reset(1)
+    return lambda signals, event: rule(signals)
 
 
 def simulate_rates(
-    episodes: int, seed: int, settings: Settings, readings: Sequence[str] = tuple(_readings())
+    episodes: int, seed: int, settings: Settings, lanes: Sequence[str] = TRIGGERS
 ) -> Data:
-    """Return rates (readings, sensors, E) of every reading; innovations and requests of the first.
+    """Return rates (lanes, sensors, E); innovations and requests of the trigger, the first lane.
 
     ``changes`` (2, E): shares of the steps after a request, then after silence, in which a
     threshold differs from the step before. ``levels`` (H, sensors) are the thresholds in force.
     """
-    lanes = _readings()
-    requested = np.empty((STEPS, len(SENSORS), len(readings) * episodes), dtype=np.bool_)
+    rules = {
+        OURS: None, PRINTED_SIGN: _replaced(sign=1.0), FIXED: _replaced(sensitivity=0.0),
+        TIMED: _replaced(threshold=0.0),
+    }  # fmt: skip
+    every = [_lane(settings, rule=rules[name]) for name in lanes]
+    requested = np.empty((STEPS, len(SENSORS), len(lanes) * episodes), dtype=np.bool_)
     innovation = np.empty((STEPS, len(SENSORS), episodes))
-    run = runs.steps([lanes[name] for name in readings], episodes, seed, settings, fusion="sici")
-    for step in run:
+    for step in runs.steps(every, episodes, seed, settings, fusion="sici"):
         requested[step.number] = step.outcome.requested
         innovation[step.number] = step.innovation[:, :episodes]
-    rates = requested.mean(0).reshape(len(SENSORS), len(readings), episodes).swapaxes(0, 1)
+    rates = requested.mean(0).reshape(len(SENSORS), len(lanes), episodes).swapaxes(0, 1)
     task = fusion_gym.make_task(CorrelatedTrackingOptions(**settings["options"]))
-    rule = fusion_gym.make_policy(settings["policy"], task)
-    assert isinstance(rule, AdaptiveInnovation)
+    rule = runs.make_trigger(settings, task)
     first, last = requested[..., :episodes], np.zeros((len(SENSORS), episodes))
     levels = np.empty(innovation.shape)
-    for number, (size, requests) in enumerate(zip(np.abs(innovation), first, strict=True)):
-        levels[number] = rule.threshold_after(last)
+    for k, (size, requests) in enumerate(zip(np.abs(innovation), first, strict=True)):
+        levels[k] = rule.threshold_after(last)
         last = np.where(requests, size, last)
     moved, after = np.diff(levels, axis=0) != 0.0, first[:-1]
     sums = [((moved & where).sum((0, 1)), where.sum((0, 1))) for where in (after, ~after)]
     changes = [changed / np.maximum(count, 1) for changed, count in sums]
     return {
-        "readings": list(readings), "rates": rates, "changes": np.array(changes),
+        "lanes": list(lanes), "rates": rates, "changes": np.array(changes),
         "levels": levels[..., 0],
         "ceiling": float(rule.threshold_after(np.zeros((len(SENSORS), 1))).max()),
         "requested": first[..., 0].astype(np.int64),
@@ -133,31 +103,22 @@ def simulate_rates(
 
 
 def _summarise_rates(data: Data) -> Data:
-    readings, rates = data["readings"], data["rates"]
-    by = dict(zip(readings, rates, strict=True))
-    ours = by[OURS]
+    percent = dict(zip(data["lanes"], 100.0 * data["rates"], strict=True))
     numbers = [
-        Number.from_sample(f"{name}, rate", 100.0 * sample, 100.0 * printed, unit="%")
-        for name, sample, printed in zip(SENSORS, ours, PRINTED, strict=True)
+        Number.from_sample(f"{name}, rate", sample, 100.0 * printed, unit="%")
+        for name, sample, printed in zip(SENSORS, percent[OURS], PRINTED, strict=True)
     ]
-    far = np.abs(100.0 * (rates.mean(-1) - np.array(PRINTED))).max(1)
-    size = np.linspace(0.0, 5.0, 51)
-    falls = [bool((np.diff(level(size, size)) < 0.0).all()) for level in (_printed, _ours)]
-    others = {name: 100.0 * by[name] for name in readings if name not in (OURS, FIXED, TIMED)}
+    size = np.tile(np.linspace(0.0, 5.0, 51), (len(SENSORS), 1))
+    levels = [runs.TriggerReading(sign=sign).threshold_after(size) for sign in (1.0, -1.0)]
     return {
-        "tables": {"rates": numbers, "readings": grid(SENSORS, others, "%")},
+        "tables": {"rates": numbers},
         "steps": STEPS, "counts": [round(STEPS * printed) for printed in PRINTED],
         "away": [(100.0 * p - n.mean) / n.spread for p, n in zip(PRINTED, numbers, strict=True)],
         "usual": float(norm.ppf(0.5 + 0.5 * 0.95 ** (1.0 / len(numbers)))),
-        "nearest": sorted(zip(far.tolist(), readings, strict=True)),
-        "percent": {
-            name: 100.0 * by[reading]
-            for name, reading in (
-                ("ours", OURS), ("printed_sign", PRINTED_SIGN), ("fixed", FIXED), ("timed", TIMED),
-            )
-        },
-        "agree": [number.verdict == "agrees" for number in numbers], "falls": falls,
-        "unmoved": float(np.ptp(_ours(0.0 * size, size))),
+        "far": np.abs(percent[OURS].mean(-1) - 100.0 * np.array(PRINTED)).max(), "percent": percent,
+        "agree": [number.verdict == "agrees" for number in numbers],
+        "falls": [bool((np.diff(level) < 0.0).all()) for level in levels],
+        "unmoved": float(np.ptp(runs.TriggerReading(sensitivity=0.0).threshold_after(size))),
         "shares": data["requested"][WINDOW].mean(0),
     }  # fmt: skip
 
@@ -178,10 +139,6 @@ def _of_other_episodes(episodes: int) -> runs.RequestFunction:
     return request
 
 
-def _always(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return np.ones_like(event)
-
-
 def simulate_fusion(
     episodes: int,
     seed: int,
@@ -194,13 +151,20 @@ def simulate_fusion(
     See :class:`ErrorRecord`. ``lanes`` are groups: the trigger at the bounds of the variances, at
     every noise scale or at the first, and two other policies at the bounds.
     """
-    scaled = {f"scale {scale}": Lane(scale) for scale in settings["scales"]}
+    lane = partial(_lane, settings)
+    scaled = {f"scale {scale}": lane(scale) for scale in settings["scales"]}
     groups = {
-        "bounds": {AT_BOUND: Lane()}, "scales": scaled, "first": dict([next(iter(scaled.items()))]),
-        "others": {OTHERS: Lane(rule=_of_other_episodes(episodes)), ALWAYS: Lane(rule=_always)},
+        "bounds": {AT_BOUND: lane()}, "scales": scaled, "first": dict([next(iter(scaled.items()))]),
+        "others": {
+            OTHERS: lane(rule=_of_other_episodes(episodes)),
+            ALWAYS: lane(rule=lambda signals, event: np.ones_like(event)),
+        },
     }  # fmt: skip
     selected = {name: lane for group in lanes for name, lane in groups[group].items()}
-    data: Data = {"lanes": list(selected), "scales": list(settings["scales"])}
+    data: Data = {
+        "lanes": list(selected), "scales": list(settings["scales"]),
+        "reached": all(ratio == 1.0 for ratio in lane().ratios),
+    }  # fmt: skip
     for fusion in fusions:
         record = runs.ErrorRecord(len(selected), episodes, with_nodes=fusion == FUSIONS[0])
         options = {"fusion": fusion, "track_actual": True}
@@ -250,8 +214,6 @@ def _summarise_fusion(data: Data) -> Data:
         for lane, scale in scaled.items()
     }
     every, first = [AT_BOUND, *scaled], next(iter(scaled))
-    inside = lanes.means("inside", scaled)
-    rule, lane, state = np.unravel_index(inside.argmin(), inside.shape)
     per_step = ("mse_steps", "conservative_steps")
     at_bound = ("mse", "conservative", "square", "level", "beats", *per_step)
     return {
@@ -262,11 +224,12 @@ def _summarise_fusion(data: Data) -> Data:
         "runs": data["sci_mse"].shape[-1], "ellipses": runs.ELLIPSES,
         "late": lanes.both("mse_steps", AT_BOUND)[:, _LATE],
         "at": {name: lanes.both(name, AT_BOUND) for name in at_bound},
-        "within": np.mean([_within(lanes, lane) for lane in scaled], axis=0), "inside": inside,
-        "where": f"{NAMES[FUSIONS[rule]]}, {[*scaled][lane]}, {STATES[state]}",
+        "inside": lanes.means("inside", scaled),
         "relative": _relative(lanes, "actual", AT_BOUND, AT_BOUND),
         "independent": _relative(lanes, "actual", OTHERS, OTHERS),
-        "price": _relative(lanes, "mse", AT_BOUND, ALWAYS), "other": lanes.both("mse", OTHERS),
+        "inverses": list(INVERSES.values()),
+        "reached": data["reached"], "price": _relative(lanes, "mse", AT_BOUND, ALWAYS),
+        "other": lanes.both("mse", OTHERS),
         "ordered": lanes.means("ordered", scaled).min(-1),
         "bounded": lanes.means("bounded", every),
         "settings": [name.removeprefix("scale ") for name in every],
@@ -284,12 +247,6 @@ def _relative(lanes: _Lanes, name: str, lane: str, other: str) -> Array:
     """MSE over the mean of another quantity, or of another setting, minus 1, in per cent."""
     mean = lanes.both(name, other).mean(-1, keepdims=True)
     return np.asarray(100.0 * (lanes.both("mse", lane) / mean - 1.0))
-
-
-def _within(lanes: _Lanes, lane: str) -> Array:
-    """The shares of a run's errors within three actual deviations, by fusion rule."""
-    error = np.abs(lanes.both("truth", lane) - lanes.both("mean", lane))
-    return np.asarray((error <= 3.0 * lanes.both("actual_deviation", lane)).mean((1, 2)))
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -434,6 +391,8 @@ def _figure(draw: Any, size: tuple[float, float], lanes: str, *fusions: str) -> 
     return PaperFigure("fusion", draw, size, restriction, without)
 
 
+_RATIO = partial(number, above=0.0, at_most=1.0)
+
 PAPER = Paper(
     "adaptive_innovation",
     (
@@ -442,7 +401,7 @@ PAPER = Paper(
     ),
     {
         "figure_3": PaperFigure(
-            "rates", _draw_thresholds, (7.2, 5.6), {"readings": [OURS]}, ("scales",)
+            "rates", _draw_thresholds, (7.2, 5.6), {"lanes": [OURS]}, ("scales",)
         ),
         "figure_4": _figure(_draw_tracking, (7.2, 6.4), "bounds"),
         "figure_5": _figure(_draw_traces, (7.2, 6.0), "bounds"),
@@ -455,6 +414,11 @@ PAPER = Paper(
     {
         "scales": Parameter((0.8, 0.6, 0.4), checks.numbers_within(above=0.0, at_most=1.0)),
         "policy": Parameter(TRIGGER, checks.policy_of(TRIGGER)),
+        "process_ratio": Parameter(1.0, _RATIO), "own_ratio": Parameter(1.0, _RATIO),
+        "start_ratio": Parameter(None, checks.number_or_none(at_least=0.0, at_most=1.0)),
+        "power": Parameter(1.0, partial(number, above=0.0, at_most=2.0)),
+        "same_step": Parameter(False, boolean),
     },
     ("process_variance", "trigger_threshold", "trigger_offset", "trigger_sensitivity"),
-)
+    READINGS,
+)  # fmt: skip

@@ -1,9 +1,9 @@
-"""Runs of the tracking example in one batch, and the record of their errors."""
+"""Runs of the tracking example in one batch, readings of its trigger, and a record of errors."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,46 +15,91 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.runs import Outcome, State
-from fusion_gym.policies.base import decide
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Requests, decide, surprise
+from fusion_gym.policies.rules.measurements import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
+from fusion_gym.systems.correlated.filters import JointErrorCovariance
 from fusion_gym.systems.correlated.system import CorrelatedTrackingPlant, CorrelatedTrackingTruth
 
 STEPS = 600
 SENSORS = ("sensor 1", "sensor 2", "sensor 3")
 ELLIPSES = 100  # the step of Figure 9
 _EVERY = 5  # steps from one comparison of the nodes' matrices to the next
+_START = np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
 _ROUNDING = 1e-8  # of a generalised eigenvalue: without noise below the bounds it is 1
 
 # Signals and the trigger's requests (sensors, N) to the requests of the same runs.
 RequestFunction = Callable[[Signals, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
+@dataclass
+class TriggerReading(AdaptiveInnovation):
+    """The trigger with another reading of (10) and (11).
+
+    ``sign`` is the sign of c and ``power`` the power of |ε| in the exponent. With ``same_step`` a
+    request needs |ε|² to reach its own threshold, l(k) = k.
+    """
+
+    sign: float = -1.0
+    power: float = 1.0
+    same_step: bool = False
+
+    def threshold_after(self, last: Array) -> Array:
+        """See :class:`AdaptiveInnovation`."""
+        return super().threshold_after(-self.sign * last**self.power)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Return the requests (sensors, N)."""
+        if self.same_step:
+            squared = surprise(signals)
+            return self.limit(squared >= self.threshold_after(np.sqrt(squared)), signals)
+        return super().__call__(signals)
+
+
+def make_trigger(settings: Settings, task: Task) -> TriggerReading:
+    """Return the trigger of the settings ``policy``, ``power`` and ``same_step``."""
+    rule: Any = fusion_gym.make_policy(settings["policy"], task)
+    return TriggerReading(**asdict(rule), power=settings["power"], same_step=settings["same_step"])
+
+
 class Lane(NamedTuple):
     """A setting of every episode: actual over bound variances, and the requests.
 
-    ``rule`` replaces the trigger's requests; ``known_start`` sets x(0) to its mean.
+    ``ratios`` are of the process noise, the sensors' own noises, and x(0). ``rule`` replaces the
+    trigger's requests.
     """
 
-    scale: float = 1.0
+    ratios: tuple[float, float, float] = (1.0, 1.0, 1.0)
     rule: RequestFunction | None = None
-    known_start: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class SideBySide(CorrelatedTrackingPlant):
-    """The plant with a noise scale for each run (N,), and runs that begin at the mean (N,)."""
+    """The plant with ``ratios`` (3, N) of each run, see :class:`Lane`."""
 
-    scales: Array
-    known_start: NDArray[np.bool_]
+    ratios: Array
 
     def _scale(self, noise: Array) -> Array:
-        return self.scales
+        return self.ratios[2]
 
     def start(self, noise: Array) -> tuple[CorrelatedTrackingTruth, None]:
-        """Return time 0, with x(0) at its mean in some runs."""
+        """Return time 0, with a scale for each noise of the following steps."""
         state, announcement = super().start(noise)
-        truth = np.where(self.known_start, self.dynamics.initial_mean, state.truth)
-        return replace(state, truth=truth), announcement
+        counts = self.dynamics.noise_channels, self.sensors.count * self.sensors.size
+        return replace(state, scale=np.repeat(self.ratios[:2], counts, axis=0)), announcement
+
+
+def actual_covariance(plant: SideBySide) -> JointErrorCovariance:
+    """Return the recursion of the actual covariances (23), (28), (43), (55) of each run."""
+    (process, own, start), model, sensors = plant.ratios, plant.dynamics, plant.sensors
+    model = replace(model, process_covariance=process * model.process_covariance)
+    model = replace(model, initial_covariance=start * model.initial_covariance)
+    covariance, crossed = process * sensors.covariance, process * sensors.cross_covariance
+    each = np.arange(sensors.count)
+    covariance[each, each] += (own - process) * sensors.deviation[:, :, None] ** 2
+    sensors = replace(sensors, covariance=covariance, cross_covariance=crossed)
+    return JointErrorCovariance.create(model, sensors)
 
 
 class Step(NamedTuple):
@@ -73,15 +118,15 @@ def steps(
     lanes = list(lanes)
     options = {"horizon": STEPS} | settings["options"] | options
     task = fusion_gym.make_task(CorrelatedTrackingOptions(**options))
-    plant = SideBySide(
-        **vars(task.plant), scales=np.repeat([lane.scale for lane in lanes], episodes),
-        known_start=np.repeat([lane.known_start for lane in lanes], episodes),
-    )  # fmt: skip
-    batch = EpisodeBatch(replace(task, plant=plant), len(lanes) * episodes)
+    ratios = np.repeat([lane.ratios for lane in lanes], episodes, axis=0).T
+    plant, estimator = SideBySide(**vars(task.plant), ratios=ratios), cast(Any, task.estimator)
+    trigger = make_trigger(settings, task)
+    joint = actual_covariance(plant) if options.get("track_actual") else None
+    task = replace(task, plant=plant, estimator=replace(estimator, joint=joint))
+    batch = EpisodeBatch(task, len(lanes) * episodes)
     runs = np.arange(batch.num_envs)
     batch.seed(runs, (seed + runs % episodes).tolist())
     batch.reset()
-    trigger = fusion_gym.make_policy(settings["policy"], task)
     for number, event in enumerate(decide(trigger, batch, seed)):
         signals = batch.signals()
         innovation = signals["innovation"][:, 0].copy()
@@ -142,14 +187,14 @@ class ErrorRecord:
     def add(self, step: Step) -> None:
         """Add a step."""
         truth, estimate = step.state.plant.truth, step.state.estimate
-        joint = step.state.plant.scale * estimate.joint
+        joint = estimate.joint
         claimed, actual = estimate.covariances[0], joint[0, 0]
         error = truth - estimate.means[0]
         deviation = np.sqrt(linalg.diagonal(actual))
         bound = np.sqrt(linalg.diagonal(claimed))
         mse, traces = (error**2).sum(0), (linalg.trace(actual), linalg.trace(claimed))
         largest = _largest(actual, claimed)
-        start = truth - np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
+        start = truth - _START
         self._add(
             mse=mse, actual=traces[0], conservative=traces[1],
             inside=np.abs(error) <= 3.0 * deviation, ordered=deviation <= bound * (1.0 + _ROUNDING),
@@ -184,7 +229,7 @@ class ErrorRecord:
         )
         if self.with_nodes:
             own = np.arange(1, len(SENSORS) + 1)
-            actual = step.state.plant.scale * estimate.joint[own, own]
+            actual = estimate.joint[own, own]
             self._add(node_bounded=_largest(actual, nodes) <= 1.0 + _ROUNDING)
             gap = np.abs(nodes - actual).max((1, 2)) / np.abs(nodes).max((1, 2))
             self._most(node_gap=gap)

@@ -23,6 +23,11 @@ def numbers_within(**limits: float) -> Callable[[str, Any], tuple[float, ...]]:
     return check
 
 
+def number_or_none(**limits: float) -> Callable[[str, Any], float | None]:
+    """Return a check for a number within limits, or None."""
+    return lambda name, value: None if value is None else number(name, value, **limits)
+
+
 def policy_of(rule: str = "NAME") -> Callable[[str, Any], str]:
     """Return a check for a policy with parameters, optionally of one rule."""
 

@@ -4,7 +4,7 @@ The environment has the exact joint covariance instead; the comparison shows the
 printed recursion.
 """
 
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,33 @@ def fused_traces(joint: Array, states: int) -> Array:
     every = np.tile(np.eye(states), (joint.shape[-1] // states, 1))
     fused = np.linalg.pinv(every.T @ np.linalg.pinv(symmetric, hermitian=True) @ every)
     return np.asarray(np.trace(fused, axis1=1, axis2=2))
+
+
+def iterated_gap(estimator: Any, node: int, horizon: int) -> float:
+    """Return a node's largest relative difference in covariance from an iterated synchronisation.
+
+    The filter works at the sampling times only, with the state equation iterated from one to the
+    next and the best predictor for noises that are correlated at the same time.
+    """
+    filters, model, sensors = estimator.filters, estimator.model, estimator.model.sensors
+    row, unfaded, noise = model.faded[node], model.unfaded[node], model.plant.noise_covariance
+    coupling, period = sensors.noise_coupling[node, :, 0], int(sensors.period[node, 0])
+    steps = list(islice(model.steps(), horizon + 1))
+    powers = [np.linalg.matrix_power(model.transition, n) for n in range(period, -1, -1)]
+    prior, gaps = steps[0].moment - np.outer(steps[0].mean, steps[0].mean), []
+    for time in range(0, horizon + 1 - period, period):
+        fading = sensors.fading_variance[node] * (unfaded @ steps[time].moment @ unfaded)
+        own = coupling @ noise @ coupling + sensors.variance[node, 0] + fading
+        scale = (time > 0) / np.sqrt(row @ prior @ row + own)
+        gain, entry = scale * (prior @ row), scale * (steps[time].input @ noise @ coupling)
+        exact = filters.covariance[node, node, ..., filters.at(np.array([time]))[0]]
+        gaps.append(np.abs(prior - np.outer(gain, gain) - exact).max() / np.abs(exact).max())
+        stride = powers[0] @ gain + powers[1] @ entry
+        prior = powers[0] @ prior @ powers[0].T - np.outer(stride, stride)
+        for power, step in zip(powers[1:], steps[time : time + period], strict=True):
+            driven = step.input @ noise @ step.input.T + step.additional
+            prior += power @ driven @ power.T
+    return float(max(gaps))
 
 
 def _joint(estimator: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:

@@ -37,17 +37,17 @@ def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Pl
     """Return a paper's Markdown from the data of all its pieces, and its numbers as plain JSON."""
     outcomes: dict[str, dict[str, float]] = {}  # by claim and reading
     claims: list[dict[str, str]] = []
-    reading, pieces = "", dict[str, Data]()
+    reading, every = "", dict[str, dict[str, Data]]()
 
     def claim(text: str, source: str, parts: Any, caller: Callable[[], str]) -> str:
         text, source = _line(text), _line(source)
         result, own = parts, outcomes.setdefault(f"{source}: {text}", {})
         if not isinstance(parts, str):
             cases = parts if isinstance(parts, Mapping) else {"": parts}
-            own |= {f"{reading}{case}": outcome(value) for case, value in cases.items()}
+            own |= {f"{reading}: {c}" if c else reading: outcome(v) for c, v in cases.items()}
             result = verdict(own.values())
-        where = ", ".join(name for name, value in own.items() if value == 1.0)
-        region = f": holds with {where}" if result == DEPENDS else ""
+        names = [name.rpartition(": ")[2] for name, value in own.items() if value == 1.0]
+        region = f": holds with {', '.join(dict.fromkeys(names))}" if result == DEPENDS else ""
         row = {"text": text, "source": source, "verdict": result, "evidence": _line(caller())}
         claims.append(row)
         cells = row | {"verdict": f"**{result}**{region}"}
@@ -61,13 +61,14 @@ def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Pl
     template = _template(f"{paper.name}.md")
     for reading in [*results][::-1]:  # the environment's is the last, and the page's
         claims.clear()
-        pieces = {
+        every[reading] = pieces = {
             piece.name: results[reading][piece.name] | piece.summarise(results[reading][piece.name])
             for piece in paper.pieces
         }
         text = template.render(
-            pieces, paper=paper.name, claim=claim, counts=counts, tally=tally, misprint=MISPRINT
-        )
+            pieces, paper=paper.name, claim=claim, counts=counts, tally=tally, every=every,
+            misprint=MISPRINT,
+        )  # fmt: skip
     lines = text.splitlines()
     tables = [
         {
