@@ -1,18 +1,17 @@
 """Lemma 1, the theorems and the remarks of round_robin_tobit in simulated episodes."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 import fusion_gym
 from agents.papers import round_robin_tobit_runs as measures
 from agents.papers.numbers import Number, grid
 from agents.papers.paper import Data, Settings
 from agents.papers.round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, censored
-from agents.papers.walk import SomeSensors, walk_in_parts
+from agents.papers.walk import SomeSensors, walk
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
@@ -25,54 +24,56 @@ PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is t
 _DRAWS = 200  # measurements an episode, at each of them
 SHARES = ((0.5, 0.5), (0.9, 0.1), (0.1, 0.9))
 SURE = 0.05  # predicted probability of no censoring, at most, of a surprise
+# Filters on the same packets.
+_SETTINGS: dict[str, Options] = {
+    "paper": {}, "adf": {"filter": "adf"}, "kalman": {"filter": "kalman"},
+    "free": {"filter": "kalman"} | FREE, "calm": {"bias_noise_covariance": [[0.0025]]},
+}  # fmt: skip
 # Where the bounds are tried: a head of the table, and what it stands for.
 EXAMPLES: dict[str, tuple[str, Options]] = {
     "oscillator": (OSCILLATOR, {}),
     "oscillator, [-0.5, 0.5]": (OSCILLATOR, {"censoring_threshold": -0.5, "censoring_upper": 0.5}),
     "target, uncensored": (TRACKING, {}),
 }
+_ENVIRONMENTS = {"oscillator": OSCILLATOR, "target": TRACKING}
 _CLEAR = 4.0  # standard errors
-# Where the text leaves a choice: the sign of φ (Theorem 4 adds it, (15) with an infinite right
-# threshold subtracts it), and whether the correction holds the filter's covariance, as printed, or
-# the bound itself.
-UPPER = {
-    "as printed": (1.0, False), "the sign of φ as in (15)": (-1.0, False),
-    "the bound in its own correction": (1.0, True), "both": (-1.0, True),
-}  # fmt: skip
-# And for the lower bound whether the factor 1 - (1 - ᾱ - β̄)² stands at every step, as printed, or
-# at the sensor's turns alone, and whether the process covariance stands whole or, as in (49), with
-# the factor (1 - ᾱ - β̄)².
-LOWER = {
-    "as printed": (False, False), "at the sensor's turns": (True, False),
-    "as in (49)": (False, True),
-}  # fmt: skip
+# Where the text leaves a choice. Upper bound: the sign of φ (Theorem 4 adds it, (15) with an
+# infinite right threshold subtracts it), and whether the correction holds the filter's covariance,
+# as printed, or the bound itself. Lower bound: whether the factor 1 - (1 - ᾱ - β̄)² stands at every
+# step, as printed, or at the sensor's turns alone, and whether the process covariance stands whole
+# or, as in (49), with the factor (1 - ᾱ - β̄)².
+_BOUNDS: tuple[tuple[str, str, tuple[Any, bool]], ...] = (
+    ("upper", "as printed", (1.0, False)), ("upper", "the sign of φ as in (15)", (-1.0, False)),
+    ("upper", "the bound in its own correction", (1.0, True)), ("upper", "both", (-1.0, True)),
+    ("lower", "as printed", (False, False)), ("lower", "at the sensor's turns", (True, False)),
+    ("lower", "as in (49)", (False, True)),
+)  # fmt: skip
+Prediction = tuple[Array, Array, Array]  # of a sensor
 SHARE = 0.5  # ε of a node, the paper's 1/p
 
 
 def simulate_theory(episodes: int, seed: int, settings: Settings) -> Data:
     """Return the data for the claims of Lemma 1, Theorems 1 and 2 and the remarks."""
-    return {
-        **_lemma(episodes, seed),
-        **{
-            f"{name}_{key}": value
-            for name, env in (("oscillator", OSCILLATOR), ("target", TRACKING))
-            for key, value in _errors(env, episodes, seed).items()
-        },
-        **_fusion(min(episodes, 200), seed), **_worth(episodes, seed),
-    }  # fmt: skip
+    data = _lemma(episodes, seed) | _fusion(min(episodes, 200), seed)
+    for example, env in _ENVIRONMENTS.items():
+        values = _errors(env, episodes, seed)
+        data |= {f"{example}_{name}": value for name, value in values.items()}
+    for name, options in _SETTINGS.items():
+        task = fusion_gym.make_task(OSCILLATOR, **options)
+        errors = measures.squares(task, "round_robin", episodes, seed)
+        data[f"mse_{name}"] = errors.sum(2).mean(1)
+        data[f"armse_{name}"] = measures.armse(errors)["mean"]
+    return data
 
 
 def _lemma(episodes: int, seed: int) -> Plain:
     """Mean and variance of y at fixed states: simulated, with standard errors, and by Lemma 1."""
     sensors = censored(fusion_gym.make_task(OSCILLATOR)).centre.sensors
-    places, draws = np.array(PLACES), episodes * _DRAWS
-    truth = np.zeros((3, len(places)))
-    truth[0] = places
+    draws, truth = episodes * _DRAWS, np.array([PLACES, *np.zeros((2, len(PLACES)))])
     noise = np.random.default_rng(seed).standard_normal((sensors.noise_channels, draws))
-    repeated = (np.repeat(truth[:, [i]], draws, axis=1) for i in range(len(places)))
-    drawn = np.stack([sensors.measure(state, noise)[0, 0] for state in repeated])
-    spread = drawn.var(1, ddof=1)
-    fourth = ((drawn - drawn.mean(1, keepdims=True)) ** 4).mean(1)
+    repeated = (np.repeat(state[:, None], draws, axis=1) for state in truth.T)
+    drawn = np.array([sensors.measure(state, noise)[0, 0] for state in repeated])
+    spread, fourth = drawn.var(1, ddof=1), stats.moment(drawn, 4, axis=1)
     means = np.broadcast_to(truth, (sensors.count, *truth.shape))
     right = expect_censored(sensors, means)
     printed = measures.PrintedTobitFilter(sensors, "theta").expect(means)
@@ -87,188 +88,126 @@ def _lemma(episodes: int, seed: int) -> Plain:
 
 def _errors(env: str, episodes: int, seed: int) -> Plain:
     """Consistency, censoring probabilities and correlation in time, along the round robin."""
-    task = fusion_gym.make_task(env)
-    names = ("nees", "predicted", "uncensored", "sure", "surprised", "product", "first", "second")
-    values = {name: np.zeros(episodes) for name in names}
-    last = np.zeros((episodes, 3))
-
-    for step, runs, batch, requests in walk_in_parts(task, "round_robin", episodes, seed):
-        error = batch.state.plant.truth - batch.state.estimate.prior_mean
-        if step:
-            earlier = last[runs].T
-            values["product"][runs] += error[2] * earlier[2]
-            values["first"][runs] += earlier[2] ** 2
-            values["second"][runs] += error[2] ** 2
-        last[runs] = error.T
-        sensor = step % task.sensors
-        signals = batch.signals()
-        inside = np.asarray(signals["uncensored_probability"])[sensor, 0]
-        free = ~np.asarray(signals["censored"])[sensor, 0]
-        sure = inside < SURE
-        values["predicted"][runs] += inside
-        values["uncensored"][runs] += free
-        values["sure"][runs] += np.where(sure, inside, 0.0)
-        values["surprised"][runs] += sure & free
-        outcome = batch.step(requests)
-        assert np.all(np.argmax(outcome.granted, axis=0) == sensor)
+    task, rows = fusion_gym.make_task(env), []
+    for step, (batch, requests) in enumerate(walk(task, "round_robin", episodes, seed)):
+        sensor, signals = step % task.sensors, batch.signals()
+        prior = batch.state.plant.truth - batch.state.estimate.prior_mean
+        values = signals["uncensored_probability"], np.logical_not(signals["censored"])
+        inside, free = (np.array(value)[sensor, 0] for value in values)
+        batch.step(requests)
         truth, estimate, *_ = batch.delivered
         error = task.plant.truth(truth) - task.estimator.mean(estimate)
         covariance = task.estimator.covariance(estimate)
-        values["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
-    for name in ("nees", "predicted", "uncensored"):
-        values[name] /= task.horizon
-    return values
+        nees = linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
+        rows.append((prior[2], inside, free, nees))
+    bias, inside, free, nees = map(np.array, zip(*rows, strict=True))
+    return {
+        "nees": nees.mean(0), "predicted": inside.mean(0), "uncensored": free.mean(0),
+        "sure": (inside * (inside < SURE)).sum(0), "surprised": ((inside < SURE) & free).sum(0),
+        "product": (bias[1:] * bias[:-1]).sum(0), "first": (bias[:-1] ** 2).sum(0),
+        "second": (bias[1:] ** 2).sum(0),
+    }  # fmt: skip
 
 
 def _fusion(episodes: int, seed: int) -> Plain:
     """Return the change of the fused estimate with the shares ε, and with B = 0 with the bias."""
-    split = [fusion_gym.make_task(OSCILLATOR, information_shares=[*each]) for each in SHARES]
-    means = [_means(task, episodes, seed) for task in split]
+
+    def means(policy: str = "round_robin", **options: Any) -> Array:
+        task, rows = fusion_gym.make_task(OSCILLATOR, **options), []
+        for batch, requests in walk(task, policy, episodes, seed):
+            batch.step(requests)
+            rows.append(np.array(task.estimator.mean(batch.delivered.estimate)))
+        return np.array(rows)
+
+    split = np.array([means(information_shares=shares) for shares in SHARES])
     no_bias: Options = {"access": "any", "bias_gain": [[0.0], [0.0]]}
-    tasks = [fusion_gym.make_task(OSCILLATOR, bias_aware=own, **no_bias) for own in (True, False)]
-    without = [_means(task, episodes, seed, "always")[..., :2, :] for task in tasks]
+    without = [means("always", bias_aware=aware, **no_bias)[:, :2] for aware in (True, False)]
     return {
-        "shares_gap": float(max(np.abs(other - means[0]).max() for other in means[1:])),
+        "shares_gap": float(np.abs(split[1:] - split[0]).max()),
         "without_gap": float(np.abs(without[0] - without[1]).max()),
     }
-
-
-def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> Array:
-    values = np.empty((task.horizon, 3, episodes))
-    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
-        batch.step(requests)
-        values[step, :, runs] = task.estimator.mean(batch.delivered.estimate)
-    return values
-
-
-def _worth(episodes: int, seed: int) -> Options:
-    """Return squared errors (episodes,), summed over states, of other filters on the same data."""
-    settings: dict[str, Plain] = {
-        "paper": {}, "adf": {"filter": "adf"}, "kalman": {"filter": "kalman"},
-        "free": {"filter": "kalman"} | FREE, "calm": {"bias_noise_covariance": [[0.0025]]},
-    }  # fmt: skip
-    data: Plain = {}
-    for name, options in settings.items():
-        task = fusion_gym.make_task(OSCILLATOR, **options)
-        errors = measures.squares(task, "round_robin", episodes, seed)
-        data[f"mse_{name}"] = errors.sum(2).mean(1)
-        data[f"armse_{name}"] = measures.armse(errors)["mean"]
-    return data
 
 
 # --- the bounds of Theorems 4 and 5 ---
 
 
-class Censoring(NamedTuple):
-    """A sensor's prediction, (N,): α, 1 - α - β, and φ of Theorem 4 without its sign."""
+class MatrixBound(NamedTuple):
+    """A bound of a sensor's covariance P⁻: P^u or P^l of Theorem 4, in a reading.
 
-    left: Array
-    inside: Array
-    narrowing: Array
-
-
-@dataclass
-class MatrixBound:
-    """A bound (states, states, N) of a sensor's covariance P⁻.
-
-    P^u or P^l of Theorem 4, in a ``reading`` of :data:`UPPER` or :data:`LOWER`. ``inflation`` is 1
-    for a single filter and ε⁻¹ for a node, whose process covariance is Q/ε by (27).
+    ``inflation`` is 1 for a single filter and ε⁻¹ for a node, whose process covariance is Q/ε by
+    (27); ``reading`` is an entry of _BOUNDS for its ``end``.
     """
 
     task: Task
     sensor: int
     inflation: float
-    upper: bool
+    end: str
     reading: tuple[Any, bool]
-    value: Array = field(default_factory=lambda: np.zeros(0), init=False)
 
-    def begin(self, covariance: Array) -> None:
-        """Start the bound as the proof does: P^u = P⁻ and P^l = 0."""
-        self.value = covariance.copy() if self.upper else np.zeros_like(covariance)
+    def advance(self, value: Array, covariance: Array, seen: Prediction, turn: bool) -> Array:
+        """Return the next step's bound (states, states, N) from this one's.
 
-    def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """Return whether (N,) it bounds P⁻."""
-        least, most = (covariance, self.value) if self.upper else (self.value, covariance)
-        return matrix_below(least, most)
-
-    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
-        """Move to the next step, given P⁻, the prediction, and whether this sensor has its turn."""
-        model = censored(self.task).model
-        stored, share = (self._updated_upper if self.upper else self._updated_lower)(
-            covariance, observed, turn
-        )
-        process = model.process_covariance * self.inflation
-        self.value = linalg.congruence(model.transition, stored) + share * process
-
-    def _updated_upper(
-        self, covariance: Array, observed: Censoring, turn: bool
-    ) -> tuple[Array, Array | float]:
-        sign, own = self.reading
-        sensors = censored(self.task).centre.sensors
-        if not turn:
-            return self.value, 1.0
-        row = sensors.measurement_matrix[self.sensor, 0]
-        cross = linalg.matvec(self.value if own else covariance, row)
-        noise = sensors.variance[self.sensor, 0] * (1.0 + sign * observed.narrowing)
-        weight = (1.0 - observed.left) ** 2
-        innovation = weight * linalg.dot(row, cross) + noise
-        return self.value - linalg.outer(cross, cross) * weight / innovation, 1.0
-
-    def _updated_lower(
-        self, covariance: Array, observed: Censoring, turn: bool
-    ) -> tuple[Array, Array | float]:
-        turns, part = self.reading
-        inside = observed.inside**2 if turn or not turns else np.zeros_like(observed.inside)
-        return (1.0 - inside) * self.value, inside if part else 1.0
+        Args:
+            value: The bound, (states, states, N).
+            covariance: P⁻ of the filter, (states, states, N).
+            seen: α, 1 - α - β and φ of Theorem 4 without its sign, (N,).
+            turn: Whether the sensor has its turn.
+        """
+        estimator, (first, second) = censored(self.task), self.reading
+        left, inside, narrowing = seen
+        model, sensors, share = estimator.model, estimator.centre.sensors, np.ones(1)
+        if self.end == "lower":
+            inside = inside**2 * (turn or not first)
+            value, share = (1.0 - inside) * value, inside if second else share
+        elif turn:
+            row = sensors.measurement_matrix[self.sensor, 0]
+            cross = linalg.matvec(value if second else covariance, row)
+            weight = (1.0 - left) ** 2
+            noise = sensors.variance[self.sensor, 0] * (1.0 + first * narrowing)
+            innovation = weight * linalg.dot(row, cross) + noise
+            value = value - linalg.outer(cross, cross) * weight / innovation
+        process = model.process_covariance * self.inflation * share
+        return linalg.congruence(model.transition, value) + process
 
 
 def failures(
-    task: Task, policy: Policy | str, episodes: int, seed: int, bounds: Sequence[MatrixBound]
-) -> tuple[Array, Array]:
-    """Return shares of an episode's steps in which a bound fails.
+    task: Task, policy: Policy | str, episodes: int, seed: int, sensors: list[int]
+) -> Array:
+    """Return shares (bounds, episodes) of an episode's steps in which each of _BOUNDS fails.
 
-    Of Theorem 4, (bounds, episodes); of Theorem 5, (pairs, episodes), for pairs of bounds of both
-    sensors in their order.
+    Of one sensor by Theorem 4; of both nodes by Theorem 5, which joins their bounds. The proof
+    starts with P^u = P⁻ and P^l = 0.
     """
-    pairs = [bounds[i : i + 2] for i in range(0, len(bounds) - 1, 2)]
-    local, fused = np.zeros((len(bounds), episodes)), np.zeros((len(pairs), episodes))
-
-    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
+    joined = len(sensors) > 1
+    inflation = 1.0 / SHARE if joined else 1.0
+    bounds = [[MatrixBound(task, m, inflation, row[0], row[2]) for m in sensors] for row in _BOUNDS]
+    failed = np.zeros((len(bounds), episodes))
+    for step, (batch, requests) in enumerate(walk(task, policy, episodes, seed)):
         covariance = batch.state.estimate.prior_covariance
-        observed = [_prediction(task, batch, sensor) for sensor in range(task.sensors)]
-        for place, bound in enumerate(bounds):
-            own = covariance * bound.inflation
-            if step == 0:
-                bound.begin(own)
-            local[place, runs] += ~bound.holds(own)
-        for place, pair in enumerate(pairs if step else []):
-            ends = _joined([item.value for item in pair]), covariance[:2, :2]
-            low, high = ends[::-1] if pair[0].upper else ends
-            fused[place, runs] += ~matrix_below(low, high)
-        for bound in bounds:
-            turn = step % task.sensors == bound.sensor
-            bound.advance(covariance * bound.inflation, observed[bound.sensor], turn)
+        own, seen = covariance * inflation, [_prediction(task, batch, m) for m in sensors]
+        if step == 0:
+            values = [[own * (node.end == "upper") for node in nodes] for nodes in bounds]
+        for i, nodes in enumerate(bounds):
+            if step:
+                limit = _joined(values[i]) if joined else values[i][0]
+                ends = limit, covariance[:2, :2] if joined else own
+                failed[i] += ~matrix_below(*ends[:: -1 if nodes[0].end == "upper" else 1])
+            values[i] = [
+                node.advance(value, own, now, step % task.sensors == node.sensor)
+                for node, value, now in zip(nodes, values[i], seen, strict=True)
+            ]
         batch.step(requests)
-    return local / (task.horizon - 1), fused / (task.horizon - 1)
+    return failed / (task.horizon - 1)
 
 
-def _bounds(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]:
-    """Return both bounds of a sensor in all their readings."""
-    return {
-        f"{end}/{name}": MatrixBound(task, sensor, inflation, end == "upper", reading)
-        for end, readings in (("upper", UPPER), ("lower", LOWER))
-        for name, reading in readings.items()
-    }
-
-
-def _prediction(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
+def _prediction(task: Task, batch: EpisodeBatch, sensor: int) -> Prediction:
     sensors = censored(task).centre.sensors
     expected = batch.state.estimate.prediction.expectation
     limit, deviation = sensors.threshold[sensor, 0], sensors.deviation[sensor, 0]
     low = (limit - expected.latent[sensor, 0]) / deviation
     hazard = gaussian.hazard(low)
     inside = expected.uncensored_probability[sensor, 0]
-    return Censoring(gaussian.upper_tail(-low), inside, hazard * (hazard - low))
+    return gaussian.upper_tail(-low), inside, hazard * (hazard - low)
 
 
 def matrix_below(first: Array, second: Array) -> NDArray[np.bool_]:
@@ -284,93 +223,72 @@ def _joined(parts: list[Array]) -> Array:
 
 
 def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return failures of the bounds of Theorems 4 and 5, also in the narrow interval.
+    """Return shares of failures (examples, cases, bounds, episodes), also in the narrow interval.
 
-    Shares of failures (episodes,) by example, theorem, end, reading and sensor.
+    The cases are Theorem 4 at both sensors, and Theorem 5.
     """
-    data: Data = {}
-    for example, (env, options) in EXAMPLES.items():
+    shares = []
+    for env, options in EXAMPLES.values():
         task = fusion_gym.make_task(env, **options)
-        for sensor in range(2):
-            single = _bounds(task, sensor, 1.0)
-            policy = SomeSensors(fusion_gym.make_policy("periodic:period=2", task), {sensor})
-            local, _ = failures(task, policy, episodes, seed, list(single.values()))
-            for name, sample in zip(single, local, strict=True):
-                data[f"{example}:4/{name}/{sensor}"] = sample
-        nodes = [_bounds(task, sensor, 1.0 / SHARE) for sensor in range(2)]
-        bounds = [node[name] for name in nodes[0] for node in nodes]
-        _, fused = failures(task, "round_robin", episodes, seed, bounds)
-        for name, sample in zip(nodes[0], fused, strict=True):
-            data[f"{example}:5/{name}"] = sample
-    return data
+        turns = fusion_gym.make_policy("periodic:period=2", task)
+        single = [failures(task, SomeSensors(turns, {m}), episodes, seed, [m]) for m in range(2)]
+        shares.append([*single, failures(task, "round_robin", episodes, seed, [0, 1])])
+    return {"shares": np.array(shares)}
 
 
 def summarise_theory(data: Data) -> Data:
     """Return the numbers of Lemma 1, Theorems 1 and 2 and the remarks."""
     numbers = {
-        "NEES of the fused estimate, oscillator": "oscillator_nees",
-        "NEES of the fused estimate, target": "target_nees",
+        **{f"NEES of the fused estimate, {name}": f"{name}_nees" for name in _ENVIRONMENTS},
         "share of uncensored packets, predicted by (9)": "oscillator_predicted",
         "share of uncensored packets, simulated": "oscillator_uncensored",
     }
-    comparisons = {
+    pairs = {
         "right": ("mean", "equation_12"), "printed": ("mean", "equation_12_printed"),
         "values": ("variance", "equation_13"), "total": ("variance", "total_variance"),
     }  # fmt: skip
-    off = {}
-    for name, (value, against) in comparisons.items():
-        error = np.maximum(data[f"{value}_error"], 1e-12)
-        off[name] = int((np.abs(data[value] - data[against]) > _CLEAR * error).sum())
+    gaps = {name: np.abs(data[own] - data[other]) for name, (own, other) in pairs.items()}
+    off = {
+        name: int((gaps[name] > _CLEAR * np.maximum(data[f"{own}_error"], 1e-12)).sum())
+        for name, (own, _) in pairs.items()
+    }
     own, free, calm = (np.array(data[f"armse_{name}"]) for name in ("paper", "free", "calm"))
     theory = [Number.from_sample(what, data[name]) for what, name in numbers.items()]
     return {
         "tables": {"theory": theory},
-        "places": PLACES, "off": off,
-        "worst": int(np.argmax(np.abs(data["mean"] - data["equation_12_printed"]))),
-        "most": int(np.argmax(np.abs(data["variance"] - data["equation_13"]))),
-        "sure_below": SURE, "correlation": _correlation(data), "node_shares": SHARES,
+        "places": PLACES, "off": off, "worst": int(gaps["printed"].argmax()),
+        "most": int(gaps["values"].argmax()),
+        "correlation": {name: _correlation(data, name) for name in _ENVIRONMENTS},
+        "sure_below": SURE, "node_shares": SHARES,
         "gap": data["oscillator_predicted"] - data["oscillator_uncensored"],
         "times": data["oscillator_surprised"].sum() / data["oscillator_sure"].sum(),
         "worse": own / free, "calmer": own / calm,
     }  # fmt: skip
 
 
-def _correlation(data: Data) -> Data:
-    """The bias's correlation of successive errors by example: its interval's ends and median."""
+def _correlation(data: Data, name: str) -> Array:
+    """The bias's correlation of successive errors: its interval's ends and median."""
     weights = measures.resampled(len(data["oscillator_nees"]))
-    result = {}
-    for name in ("oscillator", "target"):
-        parts = (f"{name}_{part}" for part in ("product", "first", "second"))
-        product, first, second = (weights @ data[part] for part in parts)
-        result[name] = np.quantile(product / np.sqrt(first * second), [0.025, 0.5, 0.975])
-    return result
+    parts = (weights @ data[f"{name}_{part}"] for part in ("product", "first", "second"))
+    product, first, second = parts
+    return np.quantile(product / np.sqrt(first * second), [0.025, 0.5, 0.975])
 
 
 def summarise_bounds(data: Data) -> Data:
     """Return the failure rates of the bounds of Theorems 4 and 5, by reading."""
-    rows = {}
-    for name in (key.partition(":")[2] for key in data if key.startswith("oscillator:")):
-        theorem, end, reading, *sensor = name.split("/")
-        which = f", sensor {int(sensor[0]) + 1}" if sensor else ""
-        samples = [100 * data[f"{example}:{name}"] for example in EXAMPLES]
-        rows[f"Theorem {theorem}, {end} bound, {reading}{which}"] = samples
-    return {
-        "examples": list(EXAMPLES),
-        "tables": {"bounds": grid(EXAMPLES, rows, "%")},
-        "ends": {
-            f"{end}_{theorem}": _summarise_bound(data, f"{theorem}/{end}")
-            for theorem in (4, 5)
-            for end in ("upper", "lower")
-        },
+    rows = {
+        f"Theorem {theorem}, {end} bound, {reading}{which}": 100 * data["shares"][:, case, bound]
+        for case, (theorem, which) in enumerate(((4, ", sensor 1"), (4, ", sensor 2"), (5, "")))
+        for bound, (end, reading, _) in enumerate(_BOUNDS)
     }
-
-
-def _summarise_bound(data: Data, bound: str) -> Data:
-    by: dict[str, list[float]] = {}
-    for reading in UPPER if bound.endswith("upper") else LOWER:
-        for example in EXAMPLES:
-            start = f"{example}:{bound}/{reading}/"
-            shares = [data[key].mean() for key in data if f"{key}/".startswith(start)]
-            by.setdefault(reading, []).append(float(max(shares)))
-    best = min(by, key=lambda reading: sum(by[reading]))
-    return {"printed": by["as printed"], "readings": len(by), "best": best, "shares": by[best]}
+    ends, shares = {}, data["shares"].mean(-1)
+    for theorem, worst in ((4, shares[:, :2].max(1)), (5, shares[:, 2])):
+        for end in ("upper", "lower"):
+            own = [i for i, row in enumerate(_BOUNDS) if row[0] == end]
+            best = min(own, key=worst.sum(0).__getitem__)
+            ends[f"{end}_{theorem}"] = {
+                "printed": worst[:, own[0]].tolist(), "readings": len(own),
+                "best": _BOUNDS[best][1], "shares": worst[:, best].tolist(),
+            }  # fmt: skip
+    tables = {"bounds": grid(EXAMPLES, rows, "%")}
+    return {"examples": list(EXAMPLES), "tables": tables, "ends": ends}
