@@ -241,7 +241,7 @@ def test_bounds_of_a_filter_that_is_never_censored() -> None:
     task = fusion_gym.make_task(biased.TRACKING)
     model = biased.censored(task).model
     covariance = model.initial_covariance.copy()
-    observed = (np.zeros(1), np.ones(1), np.zeros(1))
+    observed = (np.zeros((1, 1)), np.ones((1, 1)), np.zeros((1, 1)))
     bounds = [
         (MatrixBound(task, 0, 1.0, "upper", (-1.0, True)), covariance),
         (MatrixBound(task, 0, 1.0, "lower", (False, False)), 0.0 * covariance),

@@ -17,7 +17,7 @@ from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.centre import FederatedCentre
 from fusion_gym.systems.tobit.filters import Expectation
 from fusion_gym.systems.tobit.system import CensoredEstimator
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
+from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter, censored_moments
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
 TRACKING = "fusion_gym/BiasedTracking-v1"
@@ -190,23 +190,14 @@ class PrintedTobitFilter(TobitKalmanFilter):
             return usual._replace(truncated_variance=total)
         inside = usual.uncensored_probability
         if self.printed == "theta":
-            return self._scaled(usual.latent, deviation * deviation)
+            scaled = censored_moments(self.sensors, usual.latent, deviation**2)
+            shift = scaled.uncensored_probability * (deviation - deviation**2) * scaled.hazard
+            return scaled._replace(value=scaled.value + shift)
         if self.printed == "sign":
             return usual._replace(value=usual.value - 2.0 * inside * deviation * usual.hazard)
         width = (self.sensors.upper - self.sensors.threshold) / deviation
         shift = usual.hazard - gaussian.hazard(width)
         return usual._replace(value=usual.value - inside * deviation * shift)
-
-    def _scaled(self, latent: Array, scale: Array) -> Expectation:
-        low, high = (self.sensors.threshold - latent) / scale, (self.sensors.upper - latent) / scale
-        moments = gaussian.interval_moments(low, high)
-        below, above = gaussian.upper_tail(-low), gaussian.upper_tail(high)
-        inside = moments.probability
-        centre = latent + self.sensors.deviation * moments.mean
-        value = below * self.sensors.threshold + above * self.sensors.upper + inside * centre
-        within = np.clip(moments.variance, 1e-12, 1.0)
-        noise = inside * self.sensors.variance * within
-        return Expectation(latent, value, noise, inside, moments.mean, within)
 
 
 ROUND_ROBIN_READINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {

@@ -14,7 +14,6 @@ from agents.papers.round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, cen
 from agents.papers.walk import SomeSensors, walk
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options, Plain
 from fusion_gym.policies.base import Policy
@@ -48,7 +47,6 @@ _BOUNDS: tuple[tuple[str, str, tuple[Any, bool]], ...] = (
     ("lower", "as printed", (False, False)), ("lower", "at the sensor's turns", (True, False)),
     ("lower", "as in (49)", (False, True)),
 )  # fmt: skip
-Prediction = tuple[Array, Array, Array]  # of a sensor
 SHARE = 0.5  # ε of a node, the paper's 1/p
 
 
@@ -144,17 +142,19 @@ class MatrixBound(NamedTuple):
     end: str
     reading: tuple[Any, bool]
 
-    def advance(self, value: Array, covariance: Array, seen: Prediction, turn: bool) -> Array:
+    def advance(
+        self, value: Array, covariance: Array, seen: tuple[Array, Array, Array], turn: bool
+    ) -> Array:
         """Return the next step's bound (states, states, N) from this one's.
 
         Args:
             value: The bound, (states, states, N).
             covariance: P⁻ of the filter, (states, states, N).
-            seen: α, 1 - α - β and φ of Theorem 4 without its sign, (N,).
+            seen: α, 1 - α - β and φ of Theorem 4 without its sign, (sensors, N).
             turn: Whether the sensor has its turn.
         """
         estimator, (first, second) = censored(self.task), self.reading
-        left, inside, narrowing = seen
+        left, inside, narrowing = (value[self.sensor] for value in seen)
         model, sensors, share = estimator.model, estimator.centre.sensors, np.ones(1)
         if self.end == "lower":
             inside = inside**2 * (turn or not first)
@@ -178,36 +178,29 @@ def failures(
     Of one sensor by Theorem 4; of both nodes by Theorem 5, which joins their bounds. The proof
     starts with P^u = P⁻ and P^l = 0.
     """
-    joined = len(sensors) > 1
+    joined, node = len(sensors) > 1, censored(task).centre.sensors
     inflation = 1.0 / SHARE if joined else 1.0
     bounds = [[MatrixBound(task, m, inflation, row[0], row[2]) for m in sensors] for row in _BOUNDS]
     failed = np.zeros((len(bounds), episodes))
     for step, (batch, requests) in enumerate(walk(task, policy, episodes, seed)):
         covariance = batch.state.estimate.prior_covariance
-        own, seen = covariance * inflation, [_prediction(task, batch, m) for m in sensors]
+        own, expected = covariance * inflation, batch.state.estimate.prediction.expectation
+        low = (node.threshold - expected.latent) / node.deviation
+        hazard, inside = gaussian.hazard(low), expected.uncensored_probability
+        seen = gaussian.upper_tail(-low)[:, 0], inside[:, 0], (hazard * (hazard - low))[:, 0]
         if step == 0:
-            values = [[own * (node.end == "upper") for node in nodes] for nodes in bounds]
-        for i, nodes in enumerate(bounds):
+            values = [[own * (item.end == "upper") for item in items] for items in bounds]
+        for i, items in enumerate(bounds):
             if step:
                 limit = _joined(values[i]) if joined else values[i][0]
                 ends = limit, covariance[:2, :2] if joined else own
-                failed[i] += ~matrix_below(*ends[:: -1 if nodes[0].end == "upper" else 1])
+                failed[i] += ~matrix_below(*ends[:: -1 if items[0].end == "upper" else 1])
             values[i] = [
-                node.advance(value, own, now, step % task.sensors == node.sensor)
-                for node, value, now in zip(nodes, values[i], seen, strict=True)
+                item.advance(value, own, seen, step % task.sensors == item.sensor)
+                for item, value in zip(items, values[i], strict=True)
             ]
         batch.step(requests)
     return failed / (task.horizon - 1)
-
-
-def _prediction(task: Task, batch: EpisodeBatch, sensor: int) -> Prediction:
-    sensors = censored(task).centre.sensors
-    expected = batch.state.estimate.prediction.expectation
-    limit, deviation = sensors.threshold[sensor, 0], sensors.deviation[sensor, 0]
-    low = (limit - expected.latent[sensor, 0]) / deviation
-    hazard = gaussian.hazard(low)
-    inside = expected.uncensored_probability[sensor, 0]
-    return gaussian.upper_tail(-low), inside, hazard * (hazard - low)
 
 
 def matrix_below(first: Array, second: Array) -> NDArray[np.bool_]:
@@ -287,8 +280,9 @@ def summarise_bounds(data: Data) -> Data:
             own = [i for i, row in enumerate(_BOUNDS) if row[0] == end]
             best = min(own, key=worst.sum(0).__getitem__)
             ends[f"{end}_{theorem}"] = {
-                "printed": worst[:, own[0]].tolist(), "readings": len(own),
-                "best": _BOUNDS[best][1], "shares": worst[:, best].tolist(),
+                "cases": {_BOUNDS[i][1]: worst[:, i].max() == 0.0 for i in own},
+                "printed": worst[:, own[0]].tolist(), "best": _BOUNDS[best][1],
+                "shares": worst[:, best].tolist(),
             }  # fmt: skip
     tables = {"bounds": grid(EXAMPLES, rows, "%")}
     return {"examples": list(EXAMPLES), "tables": tables, "ends": ends}

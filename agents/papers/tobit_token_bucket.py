@@ -5,6 +5,7 @@ Source: tobit_token_bucket, Section 4.
 
 from collections.abc import Sequence
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,12 @@ import numpy as np
 from agents.papers import checks
 from agents.papers import tobit_token_bucket_runs as runs
 from agents.papers.drawing import legend, stack
-from agents.papers.numbers import below, grid
+from agents.papers.numbers import grid
 from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
 from agents.papers.tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
 from fusion_gym.entries import Options
-from fusion_gym.evaluation import run_episodes
 from fusion_gym.output.palette import FUSED, INK, MEASURED, TRUTH
 from fusion_gym.output.palette import SENSORS as COLOURS
 from fusion_gym.policies.registry import make_policy
@@ -29,15 +29,24 @@ _WHO = (*_NODE_NAMES, "fused")
 _STATES = ("first state", "second state")
 _CURVES = ("local_error", "local_trace", "fused_error", "fused_trace")
 _LONG, _WINDOW = 1000, 200  # steps
-# What each reading changes. The paper's text leaves the first two open; the others take out what
-# it has in its filter, and the last puts the standard Tobit Kalman filter in its place.
+# What the paper's text leaves open; the environment's reading is the first.
 READINGS: dict[str, Options] = {
-    "as printed, one noise of variance 0.05 on B": {},
+    "one noise of variance 0.05 on B": {},
     "noise of covariance diag(0.05, 0.05) on the states": {"process_noise": "full"},
+}
+# Changes of the filter; the last is the standard Tobit Kalman filter in its place.
+FILTERS: dict[str, Options] = {
+    "as printed": {},
     "nothing arrives: prediction, no held update": {"silent": "predict"},
     "no event error κ₆ Ξ in a delivery": {"event_error": False},
     "neither held update nor event error": {"silent": "predict", "event_error": False},
     "standard Tobit Kalman filter": {"filter": "tobit"},
+}
+# Beside the paper's filter, trigger and bucket: a name for the page, and what changes.
+_OTHERS: dict[str, tuple[str, Options]] = {
+    "ignoring": ("Kalman filters that ignore censoring", {"filter": "kalman"}),
+    "ci": ("the paper's filter, covariance intersection", {"fusion": "ci"}),
+    "sci": ("the paper's filter, sequential covariance intersection", {"fusion": "sci"}),
 }
 
 
@@ -108,7 +117,8 @@ def simulate_estimates(
     local = np.abs(np.diff(result.truth[:, None] - result.local_mean, axis=0))
     fused = np.abs(np.diff(result.truth - result.mean, axis=0))
     censored = (result.measurement <= 0.0)[1:]
-    nodes = [record_history(runs.single_sensor(m), episodes, seed) for m in singles]
+    alone = [runs.single_sensor(m, **settings["options"]) for m in singles]
+    nodes = [record_history(task, episodes, seed) for task in alone]
     return {
         "truth": result.truth[..., 0], "local": result.local_mean[..., 0],
         "fused": result.mean[..., 0], "local_change": local.mean(0), "fused_change": fused.mean(0),
@@ -177,15 +187,14 @@ def _summarise_errors(data: Data) -> Data:
 
 def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Data:
     """Return bounds, gains and condition (42); errors of long runs, starved runs, failures."""
-    task, few = scheme(), max(2, episodes // 10)
-    result = record_history(task, episodes, seed)
+    task, few = scheme(**settings["options"]), max(2, episodes // 10)
+    result = _record(episodes, seed, settings)
     gaps = [result.truth - result.mean, *(result.truth - result.local_mean[:, m] for m in _NODES)]
     bounds = [result.bound, *(result.local_bound[:, m] for m in _NODES)]
     eigenvalues, deviations = zip(*map(runs.claimed, gaps, bounds), strict=True)
-    recorded = record_history(task, few, seed)
+    recorded = _record(few, seed, settings)
     parts = runs.terms(task, recorded)
-    never = record_history(task, few, seed, "never")
-    long = record_history(scheme(horizon=_LONG), few, seed)
+    long = _record(few, seed, settings, horizon=_LONG)
     windows, traces = (
         values.reshape(-1, _WINDOW, few).mean(1) for values in (long.fused_error, long.fused_trace)
     )
@@ -195,8 +204,9 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
     gains = runs.perturbed(parts, recorded, seed)
     return {
         "eigenvalue": np.array(eigenvalues), "eigenvalue_error": np.array(deviations),
-        **{f"gain_{name}": values for name, values in gains.items()}, **runs.conditioned(parts),
-        "growth": np.exp(np.diff(np.log(never.fused_trace), axis=0)).mean(0),
+        **{f"gain_{name}": values for name, values in gains.items()},
+        **runs.conditioned(parts, task, recorded),
+        "growth": np.exp(np.diff(np.log(silent.fused_trace[:, :few]), axis=0)).mean(0),
         "windows": windows, "traces": traces, "healthy": result.fused_error.mean(0),
         "failed": np.array([item.fused_error.mean(0) for item in failed]),
         "silent": silent.fused_error.mean(0), "few": few,
@@ -213,7 +223,8 @@ def _summarise_bucket_theorems(data: Data) -> Data:
     each = {f"sensor {m + 1}": [failed] for m, failed in enumerate(data["failed"])}
     failures = {"no sensor": [data["healthy"]], **each, "all sensors": [data["silent"]]}
     return {
-        "window": _WINDOW, "long": _LONG,
+        "window": _WINDOW, "long": _LONG, "counted": runs.count_operations(),
+        "printed": runs.PRINTED_OPERATIONS,
         "tables": {
             "theorems": grid(("mean",), means),
             "failures": grid(("fused squared error",), failures),
@@ -225,37 +236,37 @@ def _summarise_bucket_theorems(data: Data) -> Data:
 
 
 def simulate_bucket_readings(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return local and fused squared errors under every reading."""
-    local, fused, share = [], [], []
-    for options in READINGS.values():
-        result = record_history(scheme(**options), episodes, seed)
-        error = result.fused_error
+    """Return local and fused squared errors of changed filters, and errors of other filters."""
+    local, fused = [], []
+    for options in FILTERS.values():
+        result = _record(episodes, seed, settings, **options)
         local.append(result.local_error.mean(0))
-        fused.append(error.mean(0))
-        share.append((error[:, None] < result.local_error).mean((0, 2)))
-    plain, free = scheme(filter="kalman"), scheme(tokens="unlimited")
+        fused.append(result.fused_error.mean(0))
+    task = scheme(**settings["options"])
+    always = _record(episodes, seed, {**settings, "policy": "always"}, tokens="unlimited")
     return {
-        "readings": list(READINGS), "local": np.array(local), "fused": np.array(fused),
-        "share": np.array(share),
-        "ignoring": run_episodes(plain, make_policy(TRIGGER, plain), episodes, seed).mse,
-        "always": run_episodes(free, make_policy("always", free), episodes, seed).mse,
+        "local": np.array(local), "fused": np.array(fused), "always": always.fused_error.mean(0),
+        **{
+            name: _record(episodes, seed, settings, **options).fused_error.mean(0)
+            for name, (_, options) in _OTHERS.items()
+        },
+        "extended": runs.filter_errors(task, result, runs.extended),
+        "unscented": runs.filter_errors(task, result, runs.unscented),
     }  # fmt: skip
 
 
 def _summarise_bucket_readings(data: Data) -> Data:
     rows = {
         name: (*local, own)
-        for name, local, own in zip(data["readings"], data["local"], data["fused"], strict=True)
+        for name, local, own in zip(FILTERS, data["local"], data["fused"], strict=True)
     }
-    others = {
-        "Kalman filters that ignore censoring, the paper's trigger and bucket": [data["ignoring"]],
+    others = {text: [data[name]] for name, (text, _) in _OTHERS.items()} | {
         "the paper's filter, always sending, no bucket": [data["always"]],
+        "one extended Kalman filter": [data["extended"]],
+        "one unscented Kalman filter": [data["unscented"]],
     }
-    not_below = below(data["fused"][:, None], data["local"]) != 1.0
-    return {
-        "columns": _WHO, "not_below": [(np.flatnonzero(row) + 1).tolist() for row in not_below],
-        "tables": {"readings": grid(_WHO, rows), "beside": grid(("fused",), others)},
-    }  # fmt: skip
+    tables = {"readings": grid(_WHO, rows), "beside": grid(("fused",), others)}
+    return {"columns": _WHO, "tables": tables}
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -354,7 +365,6 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
 
 
 _SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)
-_NO_SINGLES: Settings = {"singles": ()}
 PAPER = Paper(
     "tobit_token_bucket",
     (
@@ -366,20 +376,29 @@ PAPER = Paper(
     ),
     {
         "figure_2": PaperFigure("network", _draw_tokens, _SIZE),
-        "figure_3": PaperFigure("network", partial(_draw_measurements, component=0), _TALL),
-        "figure_4": PaperFigure("network", partial(_draw_measurements, component=1), _TALL),
-        "figure_5": PaperFigure("estimates", partial(_draw_states, sensor=0), _SIZE, _NO_SINGLES),
-        "figure_6": PaperFigure("estimates", partial(_draw_states, sensor=1), _SIZE, _NO_SINGLES),
-        "figure_7": PaperFigure("estimates", partial(_draw_states, sensor=2), _SIZE, _NO_SINGLES),
-        "figure_8": PaperFigure("errors", partial(_draw_errors, sensor=0), (7.2, 5.4)),
-        "figure_9": PaperFigure("errors", partial(_draw_errors, sensor=1), (7.2, 5.4)),
-        "figure_10": PaperFigure("errors", partial(_draw_errors, sensor=2), (7.2, 5.4)),
+        **{
+            f"figure_{3 + i}": PaperFigure(
+                "network", partial(_draw_measurements, component=i), _TALL
+            )
+            for i in range(2)
+        },
+        **{
+            f"figure_{5 + m}": PaperFigure(
+                "estimates", partial(_draw_states, sensor=m), _SIZE, {"singles": ()}
+            )
+            for m in _NODES
+        },
+        **{
+            f"figure_{8 + m}": PaperFigure("errors", partial(_draw_errors, sensor=m), (7.2, 5.4))
+            for m in _NODES
+        },
     },
     "fusion_gym/TobitOscillator-v1",
     {"policy": Parameter(TRIGGER, checks.policy_of())},
     (
         *("horizon", "token_rate", "token_capacity", "initial_tokens"),
         *("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial"),
-        *("process_variance", "measurement_variance"),
+        *("process_noise", "process_variance", "measurement_variance"),
     ),
+    {name: MappingProxyType(options) for name, options in READINGS.items()},
 )

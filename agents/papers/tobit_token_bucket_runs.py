@@ -1,5 +1,8 @@
 """Recorded episodes of the token-bucket paper, and its theorems computed on them."""
 
+from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,10 +77,11 @@ def scheme(**options: Any) -> Task:
     return fusion_gym.make_task(TobitOscillatorOptions(**options))
 
 
-def single_sensor(sensor: int) -> Task:
+def single_sensor(sensor: int, **options: Any) -> Task:
     """Return the task of a single sensor: its third of the bucket and no feedback."""
     bucket, trigger = scheme().network.bucket, DynamicEvent()
     return scheme(
+        **options,
         measurement_matrices=(np.eye(2).tolist(),), token_rate=bucket.rate / SENSORS,
         token_capacity=bucket.capacity / SENSORS,
         initial_tokens=bucket.initial / SENSORS,
@@ -135,21 +139,28 @@ class Terms(NamedTuple):
         size = 1.0 + self.pinned[..., None, :] @ turned
         return cross @ (inverse - turned / size @ turned.mT)
 
+    def _added(self, gain: Array) -> Array:
+        pinned = gain @ self.pinned[..., None]
+        return gain @ self.noise @ gain.mT + pinned @ pinned.mT
+
     def bound(self, gain: Array) -> Array:
         """Return the trace of (30) for any K q."""
         keep = np.eye(self.prior.shape[-1]) - gain @ self.matrix
-        pinned = gain @ self.pinned[..., None]
-        return np.linalg.trace(
-            self.first * keep @ self.prior @ keep.mT
-            + gain @ self.noise @ gain.mT
-            + pinned @ pinned.mT
-        )
+        return np.linalg.trace(self.first * keep @ self.prior @ keep.mT + self._added(gain))
 
     @property
     def contraction(self) -> Array:
         """Return κ₁ w a² of (42), a the largest singular value of a rotation, which is 1."""
         keep = np.eye(self.prior.shape[-1]) - self.gain @ self.matrix
-        return self.first * np.linalg.norm(keep, ord=2, axis=(-2, -1)) ** 2
+        return self.first * _norm(keep) ** 2
+
+    def limit(self, process: Array) -> Array:
+        """Return (43), infinite where (42) fails, for a node's process covariance (n, n).
+
+        The step's own norms stand for their bounds (41), so that no other Δ is smaller.
+        """
+        delta = self.contraction * _norm(process) + _norm(self._added(self.gain))
+        return np.where(self.contraction < 1.0, delta / (1.0 - self.contraction), np.inf)
 
 
 def terms(task: Task, history: History) -> Terms:
@@ -210,15 +221,26 @@ def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
     }  # fmt: skip
 
 
-def conditioned(value: Terms) -> dict[str, Array]:
-    """Return the share of steps (E,) in which condition (42) holds, of each kind."""
+def conditioned(value: Terms, task: Task, history: History) -> dict[str, Any]:
+    """Return the share of steps (E,) in which condition (42) holds, of each kind.
+
+    ``limit_above`` is the share of these steps in which (43) is above the norm of the error's
+    covariance over the episodes, ``limit_ratio`` the least ratio of both.
+    """
+    estimator: Any = task.estimator
     holds = value.contraction < 1.0
     silent = value.silent
+    error = history.truth[:, None] - history.local_mean
+    norms = _norm(np.einsum("hlie,hlje->hlij", error, error) / error.shape[-1])[..., None]
+    share = estimator.centre.share[0, 0]
+    ratio = value.limit(estimator.model.process_covariance[..., 0] / share) / norms
     return {
         "holds_delivered": (holds & ~silent).sum((0, 1)) / np.maximum((~silent).sum((0, 1)), 1),
         "holds_silent": (holds & silent).sum((0, 1)) / np.maximum(silent.sum((0, 1)), 1),
         "least_silent": np.where(silent, value.contraction, np.inf).min((0, 1)),
-    }
+        "holds": holds.mean((0, 1)), "limit_ratio": float(ratio.min()),
+        "limit_above": float((ratio[holds] >= 1.0).mean()),
+    }  # fmt: skip
 
 
 def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
@@ -233,6 +255,74 @@ def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
     values, vectors = np.linalg.eigh(second)
     along = np.einsum("tei,ti->te", whitened, vectors[..., -1]) ** 2
     return values[:, -1], along.std(-1, ddof=1) / np.sqrt(error.shape[-1])
+
+
+def _norm(matrix: Array) -> Array:
+    return np.linalg.norm(matrix, ord=2, axis=(-2, -1))
+
+
+# --- other filters, and the operations of Algorithm 1 ---
+
+Moments = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+
+
+def extended(mean: Array, covariance: Array, matrix: Array) -> tuple[Array, Array, Array]:
+    """Return mean, cross-covariance and covariance of max(C x, 0), linearised at the mean."""
+    latent = mean @ matrix.T
+    slope = matrix * (latent > 0.0)[..., None]
+    cross = covariance @ slope.mT
+    return np.maximum(latent, 0.0), cross, slope @ cross
+
+
+def unscented(mean: Array, covariance: Array, matrix: Array) -> tuple[Array, Array, Array]:
+    """Return the moments of :func:`extended` by the unscented transform with n + κ = 3."""
+    size = mean.shape[-1]
+    root = np.linalg.cholesky(3.0 * covariance).mT
+    shifts = np.concatenate((np.zeros_like(root[:, :1]), root, -root), axis=1)
+    weights = np.array([1.0 - size / 3.0, *np.full(2 * size, 1.0 / 6.0)])
+    values = np.maximum((mean[:, None] + shifts) @ matrix.T, 0.0)
+    value = weights @ values
+    apart = values - value[:, None]
+    cross = shifts.mT @ (weights[:, None] * apart)
+    return value, cross, apart.mT @ (weights[:, None] * apart)
+
+
+def filter_errors(task: Task, history: History, moments: Moments) -> Array:
+    """Return squared errors (E,) of one filter of all deliveries, thresholds zero."""
+    estimator: Any = task.estimator
+    sensors, model = estimator.centre.sensors, estimator.model
+    transition, process = model.transition[..., 0], model.process_covariance[..., 0]
+    mean, covariance = history.prior_mean[0].T, np.moveaxis(history.prior_covariance[0], -1, 0)
+    errors = []
+    for step, truth in enumerate(history.truth):
+        for m, matrix in enumerate(sensors.measurement_matrix[..., 0]):
+            value, cross, total = moments(mean, covariance, matrix)
+            total = total + np.diag(sensors.variance[m, :, 0])
+            innovation = history.measurement[step, m].T - value
+            gain = history.granted[step, m, :, None, None] * cross @ np.linalg.inv(total)
+            mean = mean + (gain @ innovation[..., None])[..., 0]
+            covariance = covariance - gain @ cross.mT
+        errors.append(((truth.T - mean) ** 2).sum(-1))
+        mean, covariance = mean @ transition.T, transition @ covariance @ transition.T + process
+    return np.mean(errors, axis=0)
+
+
+# Remark 5's terms in n_x³ and n_w of a node.
+PRINTED_OPERATIONS = {"xxx": 10, "wwx": 2, "wxx": 0, "wx": -2}
+
+
+def count_operations() -> dict[str, int]:
+    """Return the terms of :data:`PRINTED_OPERATIONS` by count, products from left to right.
+
+    (29) has A P Aᵀ and B Q Bᵀ, (30) one more product of three n_x by n_x matrices, and (50) the
+    inverse of P_m in both lines.
+    """
+    count = Counter(xxx=2)
+    for sizes in ("xxxx", "xwwx", "xxxx"):
+        for inner, outer in pairwise(sizes[1:]):
+            count["".join(sorted(sizes[0] + inner + outer))] += 2
+            count["".join(sorted(sizes[0] + outer))] -= 1
+    return {name: count[name] for name in PRINTED_OPERATIONS}
 
 
 def _squared(vector: Array) -> Array:

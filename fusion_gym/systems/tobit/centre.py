@@ -179,7 +179,7 @@ class FeedbackCentre(NodeCentre):
     all inverted covariances are regular.
 
     Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
-    equations (18)-(28).
+    equations (18)-(27).
     """
 
     fusion: FusionRule
@@ -246,7 +246,7 @@ class FederatedCentre(NodeCentre):
     noise N + Z⁻¹; a delivery adds the difference N⁻¹ - (N + Z⁻¹)⁻¹ = (N + N Z N)⁻¹.
 
     Source: tobit_token_bucket, equations (20)-(23), (50), (51); round_robin_tobit, equations
-    (18)-(28).
+    (18)-(27).
     """
 
     filter: KalmanFilter
