@@ -115,6 +115,60 @@ def test_verdicts_and_their_words() -> None:
     assert percent(0.0004) == "0.04 %"
 
 
+def test_the_limit_is_the_fixed_point_of_the_bound() -> None:
+    """(43) of a scalar system with the same gain at every step."""
+    first, process, noise, bound = 1.2, 0.3, 0.8, 1.0
+
+    def terms() -> runs.Terms:
+        one = np.ones((1, 1, 1))
+        prior, matrix = (bound + process) * one[..., None], np.ones((1, 1, 1, 1))
+        silent = np.zeros(one.shape, dtype=bool)[..., 0]
+        return runs.Terms(first, prior, matrix, one, noise * matrix, 0.0 * one, silent)
+
+    for _ in range(200):
+        bound = terms().bound(terms().gain).item()
+    assert terms().contraction.item() < 1.0
+    assert terms().limit(np.array([[process]])).item() == pytest.approx(bound)
+
+
+def test_other_filters_have_the_moments_of_a_clipped_value() -> None:
+    """Exact far from the threshold; at it, the unscented points are 0 and ±√(3 P)."""
+    covariance, matrix = np.array([[[0.4, 0.1], [0.1, 0.3]]]), np.array([[1.0, 0.5], [0.0, 2.0]])
+    cross = covariance @ matrix.T
+    for moments in (runs.extended, runs.unscented):
+        results = moments(np.full((1, 2), 50.0), covariance, matrix)
+        expected = (np.array([[75.0, 100.0]]), cross, matrix @ cross)
+        for value, own in zip(results, expected, strict=True):
+            np.testing.assert_allclose(value, own, rtol=1e-9)
+    start = np.zeros((1, 2)), np.eye(2)[None], np.eye(2)
+    assert np.abs(np.concatenate([np.ravel(item) for item in runs.extended(*start)])).max() == 0.0
+    np.testing.assert_allclose(runs.unscented(*start)[0], np.sqrt(3.0) / 6.0, rtol=1e-12)
+
+
+def test_a_linear_filter_of_the_deliveries_is_the_federated_kalman_filter() -> None:
+    task = runs.scheme(filter="kalman")
+    history = runs.record_history(task, 3, 0)
+
+    def linear(
+        mean: NDArray[np.float64], covariance: NDArray[np.float64], matrix: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        cross = covariance @ matrix.T
+        return mean @ matrix.T, cross, matrix @ cross
+
+    np.testing.assert_allclose(
+        runs.filter_errors(task, history, linear), history.fused_error.mean(0), rtol=1e-6
+    )
+
+
+def test_operations_of_a_product_of_three() -> None:
+    """A (x, w) by (w, w) by (w, x) product takes x w (2 w - 1) + x² (2 w - 1) operations."""
+    count = runs.count_operations()
+    assert count == {"xxx": 10, "wwx": 2, "wxx": 2, "wx": -1}
+    for x, w in ((2, 1), (3, 4)):
+        own = count["wwx"] * x * w**2 + count["wxx"] * x**2 * w + count["wx"] * x * w - x**2
+        assert own == x * w * (2 * w - 1) + x**2 * (2 * w - 1)
+
+
 # --- the biased oscillator ----------------------------------------------------------------------
 
 

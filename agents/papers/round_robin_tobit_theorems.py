@@ -212,7 +212,7 @@ def matrix_below(first: Array, second: Array) -> NDArray[np.bool_]:
 
 def _joined(parts: list[Array]) -> Array:
     """Return (Σ P_m⁻¹)⁻¹ of x, as Theorem 5 joins the bounds; NaN for an indefinite bound."""
-    return linalg.inverse(sum((linalg.inverse(part) for part in parts), np.zeros(1)))[:2, :2]
+    return linalg.inverse(sum(map(linalg.inverse, parts), np.zeros(1)))[:2, :2]
 
 
 def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:

@@ -42,12 +42,10 @@ FILTERS: dict[str, Options] = {
     "neither held update nor event error": {"silent": "predict", "event_error": False},
     "standard Tobit Kalman filter": {"filter": "tobit"},
 }
-# Beside the paper's filter, trigger and bucket: a name for the page, and what changes.
-_OTHERS: dict[str, tuple[str, Options]] = {
-    "ignoring": ("Kalman filters that ignore censoring", {"filter": "kalman"}),
-    "ci": ("the paper's filter, covariance intersection", {"fusion": "ci"}),
-    "sci": ("the paper's filter, sequential covariance intersection", {"fusion": "sci"}),
-}
+# Other filters and fusion rules under the paper's trigger and bucket.
+_OTHERS: dict[str, Options] = {
+    "ignoring": {"filter": "kalman"}, "ci": {"fusion": "ci"}, "sci": {"fusion": "sci"},
+}  # fmt: skip
 
 
 def _record(episodes: int, seed: int, settings: Settings, **options: Any) -> History:
@@ -243,30 +241,21 @@ def simulate_bucket_readings(episodes: int, seed: int, settings: Settings) -> Da
         local.append(result.local_error.mean(0))
         fused.append(result.fused_error.mean(0))
     task = scheme(**settings["options"])
-    always = _record(episodes, seed, {**settings, "policy": "always"}, tokens="unlimited")
     return {
-        "local": np.array(local), "fused": np.array(fused), "always": always.fused_error.mean(0),
-        **{
-            name: _record(episodes, seed, settings, **options).fused_error.mean(0)
-            for name, (_, options) in _OTHERS.items()
-        },
+        "local": np.array(local),
+        "fused": np.array(fused),
         "extended": runs.filter_errors(task, result, runs.extended),
         "unscented": runs.filter_errors(task, result, runs.unscented),
-    }  # fmt: skip
+        **{
+            name: _record(episodes, seed, settings, **options).fused_error.mean(0)
+            for name, options in _OTHERS.items()
+        },
+    }
 
 
 def _summarise_bucket_readings(data: Data) -> Data:
-    rows = {
-        name: (*local, own)
-        for name, local, own in zip(FILTERS, data["local"], data["fused"], strict=True)
-    }
-    others = {text: [data[name]] for name, (text, _) in _OTHERS.items()} | {
-        "the paper's filter, always sending, no bucket": [data["always"]],
-        "one extended Kalman filter": [data["extended"]],
-        "one unscented Kalman filter": [data["unscented"]],
-    }
-    tables = {"readings": grid(_WHO, rows), "beside": grid(("fused",), others)}
-    return {"columns": _WHO, "tables": tables}
+    rows = {name: (*data["local"][i], data["fused"][i]) for i, name in enumerate(FILTERS)}
+    return {"columns": _WHO, "tables": {"readings": grid(_WHO, rows)}}
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -292,11 +281,9 @@ def _draw_tokens(figure: Any, data: Data) -> None:
             (granted[:, sensor], "|", 9, 1.8),
             (requested[:, sensor] & ~granted[:, sensor], "x", 4, 1.0),
         ):
-            times = time[selection]
-            lower.plot(
-                times, np.full(len(times), SENSORS - sensor), mark, color=COLOURS[sensor], ms=size,
-                mew=width,
-            )  # fmt: skip
+            places = np.full(selection.sum(), SENSORS - sensor)
+            style: Data = {"color": COLOURS[sensor], "ms": size, "mew": width}
+            lower.plot(time[selection], places, mark, **style)
     lower.set_yticks(range(1, SENSORS + 1), _NODE_NAMES[::-1])
     lower.set_ylim(0.4, SENSORS + 0.6)
     lower.grid(axis="y", visible=False)
@@ -365,6 +352,7 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
 
 
 _SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)
+_NO_SINGLES: Settings = {"singles": ()}
 PAPER = Paper(
     "tobit_token_bucket",
     (
@@ -376,22 +364,14 @@ PAPER = Paper(
     ),
     {
         "figure_2": PaperFigure("network", _draw_tokens, _SIZE),
-        **{
-            f"figure_{3 + i}": PaperFigure(
-                "network", partial(_draw_measurements, component=i), _TALL
-            )
-            for i in range(2)
-        },
-        **{
-            f"figure_{5 + m}": PaperFigure(
-                "estimates", partial(_draw_states, sensor=m), _SIZE, {"singles": ()}
-            )
-            for m in _NODES
-        },
-        **{
-            f"figure_{8 + m}": PaperFigure("errors", partial(_draw_errors, sensor=m), (7.2, 5.4))
-            for m in _NODES
-        },
+        "figure_3": PaperFigure("network", partial(_draw_measurements, component=0), _TALL),
+        "figure_4": PaperFigure("network", partial(_draw_measurements, component=1), _TALL),
+        "figure_5": PaperFigure("estimates", partial(_draw_states, sensor=0), _SIZE, _NO_SINGLES),
+        "figure_6": PaperFigure("estimates", partial(_draw_states, sensor=1), _SIZE, _NO_SINGLES),
+        "figure_7": PaperFigure("estimates", partial(_draw_states, sensor=2), _SIZE, _NO_SINGLES),
+        "figure_8": PaperFigure("errors", partial(_draw_errors, sensor=0), (7.2, 5.4)),
+        "figure_9": PaperFigure("errors", partial(_draw_errors, sensor=1), (7.2, 5.4)),
+        "figure_10": PaperFigure("errors", partial(_draw_errors, sensor=2), (7.2, 5.4)),
     },
     "fusion_gym/TobitOscillator-v1",
     {"policy": Parameter(TRIGGER, checks.policy_of())},

@@ -81,10 +81,8 @@ def single_sensor(sensor: int, **options: Any) -> Task:
     """Return the task of a single sensor: its third of the bucket and no feedback."""
     bucket, trigger = scheme().network.bucket, DynamicEvent()
     return scheme(
-        **options,
-        measurement_matrices=(np.eye(2).tolist(),), token_rate=bucket.rate / SENSORS,
-        token_capacity=bucket.capacity / SENSORS,
-        initial_tokens=bucket.initial / SENSORS,
+        **options, measurement_matrices=(np.eye(2).tolist(),), token_rate=bucket.rate / SENSORS,
+        token_capacity=bucket.capacity / SENSORS, initial_tokens=bucket.initial / SENSORS,
         trigger_threshold=trigger.column("threshold", SENSORS)[sensor],
         trigger_decay=trigger.column("decay", SENSORS)[sensor],
     )  # fmt: skip
@@ -224,12 +222,11 @@ def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
 def conditioned(value: Terms, task: Task, history: History) -> dict[str, Any]:
     """Return the share of steps (E,) in which condition (42) holds, of each kind.
 
-    ``limit_above`` is the share of these steps in which (43) is above the norm of the error's
-    covariance over the episodes, ``limit_ratio`` the least ratio of both.
+    ``limit_ratio`` is the least ratio of (43) to the norm of the error's covariance over the
+    episodes.
     """
     estimator: Any = task.estimator
-    holds = value.contraction < 1.0
-    silent = value.silent
+    holds, silent = value.contraction < 1.0, value.silent
     error = history.truth[:, None] - history.local_mean
     norms = _norm(np.einsum("hlie,hlje->hlij", error, error) / error.shape[-1])[..., None]
     share = estimator.centre.share[0, 0]
@@ -239,7 +236,6 @@ def conditioned(value: Terms, task: Task, history: History) -> dict[str, Any]:
         "holds_silent": (holds & silent).sum((0, 1)) / np.maximum(silent.sum((0, 1)), 1),
         "least_silent": np.where(silent, value.contraction, np.inf).min((0, 1)),
         "holds": holds.mean((0, 1)), "limit_ratio": float(ratio.min()),
-        "limit_above": float((ratio[holds] >= 1.0).mean()),
     }  # fmt: skip
 
 
