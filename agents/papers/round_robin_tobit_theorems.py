@@ -8,7 +8,7 @@ from scipy import stats
 
 import fusion_gym
 from agents.papers import round_robin_tobit_runs as measures
-from agents.papers.numbers import Number, grid
+from agents.papers.numbers import Number, always, grid
 from agents.papers.paper import Data, Settings
 from agents.papers.round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, censored
 from agents.papers.walk import SomeSensors, walk
@@ -274,13 +274,13 @@ def summarise_bounds(data: Data) -> Data:
         for case, (theorem, which) in enumerate(((4, ", sensor 1"), (4, ", sensor 2"), (5, "")))
         for bound, (end, reading, _) in enumerate(_BOUNDS)
     }
-    ends, shares = {}, data["shares"].mean(-1)
+    ends, shares, count = {}, data["shares"].mean(-1), data["shares"].shape[-1]
     for theorem, worst in ((4, shares[:, :2].max(1)), (5, shares[:, 2])):
         for end in ("upper", "lower"):
             own = [i for i, row in enumerate(_BOUNDS) if row[0] == end]
             best = min(own, key=worst.sum(0).__getitem__)
             ends[f"{end}_{theorem}"] = {
-                "cases": {_BOUNDS[i][1]: worst[:, i].max() == 0.0 for i in own},
+                "cases": {_BOUNDS[i][1]: always(1.0 - worst[:, i].max(), count) for i in own},
                 "printed": worst[:, own[0]].tolist(), "best": _BOUNDS[best][1],
                 "shares": worst[:, best].tolist(),
             }  # fmt: skip
