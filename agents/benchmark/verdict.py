@@ -15,7 +15,7 @@ from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.episodes import run_several
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers.silence import cost_bound
 from fusion_gym.validation import ConfigurationError
@@ -72,9 +72,9 @@ class TestResult:
 def run_test(job: TestJob) -> tuple[TestResult, ...]:
     """Return the result of each policy at its price."""
     task, result = job.task(), []
-    for text, price in zip(job.policies, job.prices, strict=True):
-        policy = make_policy(text, task)
-        results = run_episodes(task, policy, job.episodes, seeds.TEST.start)
+    policies = [make_policy(text, task) for text in job.policies]
+    every = run_several(task, policies, job.episodes, seeds.TEST.start)
+    for text, price, results in zip(job.policies, job.prices, every, strict=True):
         rate, mse = float(results.rate.mean()), float(results.mse.mean())
         result.append(TestResult(text, price, results.error_cost, results.tokens, mse, rate))
     return tuple(result)

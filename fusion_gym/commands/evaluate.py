@@ -20,7 +20,7 @@ from fusion_gym.commands.options import Episodes, OutputFile, Seed
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments, Plain
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import BATCH, EpisodeResults, run_episodes, run_several
 from fusion_gym.evaluation.metrics import (
     METRICS,
     Interval,
@@ -110,17 +110,24 @@ class Evaluate(EnvironmentOptions, Long):
             writing(("the results of each policy", self.json))
         earlier = steps * len(done["policies"].keys() & policies.keys())
         with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
-            for name, policy in policies.items():
-                if name in done["policies"]:
-                    report["policies"][name] = done["policies"][name]
-                    report["quantiles"][name] = done["quantiles"][name]
-                    continue
-                bar.say(name)
-                results[name] = run_episodes(task, policy, self.episodes, self.seed, bar.update)
-                report["policies"][name] = summarise(results[name])
-                report["quantiles"][name] = robust_summary(results[name])
+            for part in ("policies", "quantiles"):
+                report[part] |= {
+                    name: done[part][name] for name in names if name in done["policies"]
+                }
+            rest = [name for name in names if name not in done["policies"]]
+            size = max(1, BATCH // self.episodes)
+            for some in (rest[first : first + size] for first in range(0, len(rest), size)):
+                bar.say(some[0] if len(some) == 1 else f"{len(some)} policies")
+                built = [policies[name] for name in some]
+                every = run_several(task, built, self.episodes, self.seed, bar.update)
+                for name, result in zip(some, every, strict=True):
+                    results[name] = result
+                    report["policies"][name] = summarise(result)
+                    report["quantiles"][name] = robust_summary(result)
+                    warn_of_draws(name, task, policies[name], result, self.seed)
                 write(self.json, report)
-                warn_of_draws(name, task, policy, results[name], self.seed)
+        for part in ("policies", "quantiles"):  # in the order of the command line
+            report[part] = {name: report[part][name] for name in names}
         differences = {
             name: paired_difference(result, results[self.reference])
             for name, result in results.items()

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from fusion_gym.commands.command_line import Command
 from fusion_gym.output.tables import console
-from fusion_gym.training.catalogue import Entry, catalogue
+from fusion_gym.training.catalogue import CATALOGUE, Entry, catalogue
 from fusion_gym.validation import keys
 
 
@@ -30,10 +30,9 @@ class List(Command):
 
     def run(self) -> None:
         """Print a table of each kind, or the environments and the names of all other kinds."""
-        entries = catalogue()
-        keys("kind", self.kinds, entries)
-        tables = {kind: entries[kind] for kind in self.kinds}
-        if not tables:
+        keys("kind", self.kinds, CATALOGUE)
+        tables = entries = catalogue(*self.kinds)
+        if not self.kinds:
             lines = {kind: ", ".join(entries.pop(kind)) for kind in [*entries][1:]}
             names = {k: Entry(shorten(v, 270, placeholder=" …"), str) for k, v in lines.items()}
             tables = entries | {"fusion-gym list KIND": names}

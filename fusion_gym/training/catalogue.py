@@ -27,30 +27,36 @@ class Entry(NamedTuple):
     page: Callable[[], str]
 
 
-def catalogue() -> dict[str, dict[str, Entry]]:
-    """Return the entries of every kind by name, including the user's registrations."""
-    return {
-        "environments": {
-            env_id: Entry(read(options_of(env_id)).summary, partial(_environment, env_id))
-            for env_id in ENVIRONMENTS
-        },
-        "rules": {name: _declared(policy_maker(name)) for name in policy_names("rule")},
-        "references": {name: _declared(policy_maker(name)) for name in policy_names("reference")},
-        "filters": _filters(),
-        "fusion": {name: _declared(type(row.make()), row.meaning) for name, row in RULES.items()},
-        "signals": _signals(),
-        "metrics": {
-            name: Entry(row.meaning, partial(str, row.meaning)) for name, row in METRICS.items()
-        },
-        "algorithms": {
-            name: Entry(row.meaning, partial(_settings, name)) for name, row in TABLE.items()
-        },
-        "zoo": {name: _agent(name) for name in zoo.names()},
-        "configs": {
-            path.stem: _config(path.read_text(encoding="utf-8"))
-            for path in sorted(SHIPPED.glob("*.yaml"))
-        },
-    }
+# The entries of each kind by name, including the user's registrations.
+CATALOGUE: dict[str, Callable[[], dict[str, Entry]]] = {
+    "environments": lambda: {
+        env_id: Entry(read(options_of(env_id)).summary, partial(_environment, env_id))
+        for env_id in ENVIRONMENTS
+    },
+    "rules": lambda: {name: _declared(policy_maker(name)) for name in policy_names("rule")},
+    "references": lambda: {
+        name: _declared(policy_maker(name)) for name in policy_names("reference")
+    },
+    "filters": lambda: _filters(),
+    "fusion": lambda: {n: _declared(type(row.make()), row.meaning) for n, row in RULES.items()},
+    "signals": lambda: _signals(),
+    "metrics": lambda: {
+        name: Entry(row.meaning, partial(str, row.meaning)) for name, row in METRICS.items()
+    },
+    "algorithms": lambda: {
+        name: Entry(row.meaning, partial(_settings, name)) for name, row in TABLE.items()
+    },
+    "zoo": lambda: {name: _agent(name) for name in zoo.names()},
+    "configs": lambda: {
+        path.stem: _config(path.read_text(encoding="utf-8"))
+        for path in sorted(SHIPPED.glob("*.yaml"))
+    },
+}
+
+
+def catalogue(*kinds: str) -> dict[str, dict[str, Entry]]:
+    """Return the entries of some kinds, by default of all."""
+    return {kind: CATALOGUE[kind]() for kind in kinds or CATALOGUE}
 
 
 def _declared(owner: Any, meaning: str = "") -> Entry:
