@@ -9,12 +9,11 @@ import importlib.util
 import re
 from collections.abc import Iterator
 from contextvars import ContextVar
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from fusion_gym.errors import forbidden
-from fusion_gym.validation import ConfigurationError, nested, read_text
+from fusion_gym.validation import ConfigurationError, nested
 
 TRUST: ContextVar[bool] = ContextVar("trust", default=False)
 _ENVIRONMENTS = ("env", "environment", "id", "error")  # keys whose values with a colon name code
@@ -60,16 +59,6 @@ def import_named(field: str, text: str) -> Any:
     if not hasattr(result, name):
         raise forbidden(field, text, f"the module {module!r} has no {name!r}")
     return getattr(result, name)
-
-
-def load_yaml(field: str, path: Path) -> Any:
-    """Return the content of a YAML file, whose reader is an optional package."""
-    source = f"{field} = {str(path)!r}"
-    try:
-        from fusion_gym.yaml_text import parsed
-    except ModuleNotFoundError:
-        raise ConfigurationError(f"{source} needs PyYAML: pip install pyyaml") from None
-    return parsed(read_text(field, path), source)
 
 
 def require(user: str, extra: str, *packages: str) -> None:

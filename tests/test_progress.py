@@ -106,14 +106,15 @@ def test_an_interrupted_evaluation_says_how_to_go_on(
 ) -> None:
     file, ran = tmp_path / "evaluation.json", []
 
-    def run_episodes(task: Any, policy: Any, *value: Any) -> Any:
-        ran.append(policy)
+    def run_several(task: Any, policies: Any, *value: Any) -> Any:
+        ran.extend(policies)
         if len(ran) == 2:
             raise KeyboardInterrupt
-        return whole(task, policy, *value)
+        return whole(task, policies, *value)
 
-    whole = evaluate.run_episodes
-    monkeypatch.setattr(evaluate, "run_episodes", run_episodes)
+    whole = evaluate.run_several
+    monkeypatch.setattr(evaluate, "run_several", run_several)
+    monkeypatch.setattr(evaluate, "BATCH", 1)
     ended = call("evaluate", [*EVALUATE, "--json", str(file)])
     assert (ended.status, ended.trace) == (130, "")
     assert ended.err.splitlines()[0] == f"writing the results of each policy into {file}"
@@ -128,10 +129,10 @@ def test_an_interrupted_evaluation_says_how_to_go_on(
 
 
 def test_an_interrupt_that_loses_all_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run_episodes(*_: Any) -> Any:
+    def run_several(*_: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evaluate, "run_episodes", run_episodes)
+    monkeypatch.setattr(evaluate, "run_several", run_several)
     ended = call("evaluate", EVALUATE)
     assert (ended.status, ended.err.splitlines()[-1]) == (
         130, "interrupted: nothing is saved (--json FILE saves finished policies)",

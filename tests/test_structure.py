@@ -21,6 +21,7 @@ FLOORS = {
     "importing": 0,
     "linalg": 0,
     "namespace": 0,
+    "option_file": 0,
     "seeds": 0,
     "validation": 0,
     "version": 0,

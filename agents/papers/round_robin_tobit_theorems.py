@@ -143,18 +143,18 @@ class MatrixBound(NamedTuple):
     reading: tuple[Any, bool]
 
     def advance(
-        self, value: Array, covariance: Array, seen: tuple[Array, Array, Array], turn: bool
+        self, value: Array, covariance: Array, censoring: tuple[Array, Array, Array], turn: bool
     ) -> Array:
         """Return the next step's bound (states, states, N) from this one's.
 
         Args:
             value: The bound, (states, states, N).
             covariance: P⁻ of the filter, (states, states, N).
-            seen: α, 1 - α - β and φ of Theorem 4 without its sign, (sensors, N).
+            censoring: α, 1 - α - β and φ of Theorem 4 without its sign, (sensors, N).
             turn: Whether the sensor has its turn.
         """
         estimator, (first, second) = censored(self.task), self.reading
-        left, inside, narrowing = (value[self.sensor] for value in seen)
+        left, inside, narrowing = (value[self.sensor] for value in censoring)
         model, sensors, share = estimator.model, estimator.centre.sensors, np.ones(1)
         if self.end == "lower":
             inside = inside**2 * (turn or not first)
@@ -187,7 +187,7 @@ def failures(
         own, expected = covariance * inflation, batch.state.estimate.prediction.expectation
         low = (node.threshold - expected.latent) / node.deviation
         hazard, inside = gaussian.hazard(low), expected.uncensored_probability
-        seen = gaussian.upper_tail(-low)[:, 0], inside[:, 0], (hazard * (hazard - low))[:, 0]
+        censoring = gaussian.upper_tail(-low)[:, 0], inside[:, 0], (hazard * (hazard - low))[:, 0]
         if step == 0:
             values = [[own * (item.end == "upper") for item in items] for items in bounds]
         for i, items in enumerate(bounds):
@@ -196,7 +196,7 @@ def failures(
                 ends = limit, covariance[:2, :2] if joined else own
                 failed[i] += ~matrix_below(*ends[:: -1 if items[0].end == "upper" else 1])
             values[i] = [
-                item.advance(value, own, seen, step % task.sensors == item.sensor)
+                item.advance(value, own, censoring, step % task.sensors == item.sensor)
                 for item, value in zip(items, values[i], strict=True)
             ]
         batch.step(requests)

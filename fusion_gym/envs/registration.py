@@ -23,7 +23,8 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.option_text import Option, list_options, options_in
 from fusion_gym.errors import forbidden, refusal
-from fusion_gym.importing import imported, load_yaml, name_of
+from fusion_gym.importing import imported, name_of
+from fusion_gym.option_file import load_yaml
 from fusion_gym.validation import ConfigurationError
 
 Build = Callable[[Any], Scenario]

@@ -14,8 +14,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import CommonOptions, plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
-from fusion_gym.importing import load_yaml
 from fusion_gym.namespace import namespace, take
+from fusion_gym.option_file import load_yaml
 
 _NAME, _END = "schedule", "end"
 _ENDS = ("repeat", "hold")

@@ -17,7 +17,8 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.options import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
-from fusion_gym.importing import load_yaml, require
+from fusion_gym.importing import require
+from fusion_gym.option_file import load_yaml
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import Truth
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
