@@ -24,7 +24,7 @@ def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
             return array.repeat(len(runs), axis=-1)
         return array.take(runs, axis=-1)
 
-    return _mapped(taken, state)
+    return map_arrays(taken, state)
 
 
 def merge_runs(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:
@@ -35,26 +35,33 @@ def merge_runs(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:
         result[..., runs] = part
         return result
 
-    return _mapped(merged, old, new)
+    return map_arrays(merged, old, new)
 
 
-def _mapped(function: Callable[..., Any], first: Any, *others: Any) -> Any:
+def arrays_of(state: Any) -> list[NDArray[Any]]:
+    """Return the arrays of a state, in the order of :func:`map_arrays`."""
+    result: list[NDArray[Any]] = []
+    map_arrays(result.append, state)
+    return result
+
+
+def map_arrays(function: Callable[..., Any], first: Any, *others: Any) -> Any:
     """Return a state of the form of ``first``, with a function of the arrays in each place."""
-    if isinstance(first, np.ndarray):
+    if hasattr(first, "dtype"):
         return function(first, *others)
     if first is None:
         return None
     if isinstance(first, tuple):
-        parts = [_mapped(function, *each) for each in zip(first, *others, strict=True)]
+        parts = [map_arrays(function, *each) for each in zip(first, *others, strict=True)]
         return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
     if isinstance(first, dict):
         return {
-            name: _mapped(function, part, *(other[name] for other in others))
+            name: map_arrays(function, part, *(other[name] for other in others))
             for name, part in first.items()
         }
     if callable(first):
-        return lambda: _mapped(function, first(), *(other() for other in others))
+        return lambda: map_arrays(function, first(), *(other() for other in others))
     names = (field.name for field in dataclasses.fields(first))
     states = (first, *others)
     fields = ((getattr(state, name) for state in states) for name in names)
-    return type(first)(*(_mapped(function, *each) for each in fields))
+    return type(first)(*(map_arrays(function, *each) for each in fields))

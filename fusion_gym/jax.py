@@ -36,7 +36,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 from jax.custom_batching import custom_vmap  # noqa: E402
 
-from fusion_gym.core.compiled import refuse_in_forks, register_state  # noqa: E402
+from fusion_gym.core.jitted import refuse_in_forks, register_state  # noqa: E402
 
 
 class EnvParams(NamedTuple):

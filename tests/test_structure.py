@@ -20,6 +20,7 @@ FLOORS = {
     "gaussian": 0,
     "importing": 0,
     "linalg": 0,
+    "lowering": 0,
     "namespace": 0,
     "option_file": 0,
     "seeds": 0,

@@ -110,6 +110,8 @@ USES = {
     "render": "import gymnasium, fusion_gym; e = gymnasium.make('fusion_gym/LinearFusion-v2', "
     "render_mode='rgb_array'); e.reset(seed=0); e.render()",
     "jax": "import fusion_gym.jax; fusion_gym.jax.make('fusion_gym/LinearFusion-v2')",
+    "compiled": "import gymnasium, fusion_gym; gymnasium.make('fusion_gym/LinearFusion-v2', "
+    "backend='compiled').reset()",
     "dask": "from distributed import Client",
     "agents": "import fusion_gym, cmaes, tensorboard; fusion_gym.train, fusion_gym.parallel_env",
 }

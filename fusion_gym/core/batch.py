@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,6 @@ from fusion_gym.core.runs import (
 )
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
-
-if TYPE_CHECKING:
-    from fusion_gym.core.compiled import CompiledStep
 
 # Normals in a block, of one run and of all runs (64 MB); a block has at least one step.
 _BLOCK_OF_RUN, _BLOCK = 2**11, 2**23
@@ -81,10 +78,10 @@ class EpisodeBatch(Runs):
             reference is not None and memory.keeps_every and reference is task.memory_estimator
         )
         self._full_state: Any = None  # the reference's state after observing
-        self._program = self._compiled() if task.backend == "jax" else None
+        self._program = self._make_program()
         # State, position and observations (entries, N) after the program's last step.
         self._computed: Lazy | None = None
-        self._rows: list[Any] = []
+        self._rows: Any = None
         self._observed: NDArray[np.float32] | None = None
         self.price = task.reward.price.draw(np.zeros(num_envs))
         self.steps = np.zeros(num_envs, dtype=np.int64)
@@ -150,6 +147,9 @@ class EpisodeBatch(Runs):
         )
         noise = np.concatenate([_starts(source, keys, count) for source, count in sources])
         row = self.normals() if everyone else self.normals()[:, runs]
+        if task.backend == "compiled" and self._program is not None and self.reference is None:
+            self._begin(noise, row, None if everyone else runs)
+            return
         start, announcement = start_of(task, noise)
         state = advance(task, start, row, self.steps[runs])
         first, measurement = (task.plant.measurement(part.plant) for part in (start, state))
@@ -180,7 +180,7 @@ class EpisodeBatch(Runs):
         if self._state is None:
             raise RuntimeError("call reset before the first step")
         outcome = self.deliver(requests) if self._program is None else self._run_program(requests)
-        if not math.isfinite(np.vdot(outcome.error, outcome.error)):
+        if np.count_nonzero(outcome.diverged) and not np.isfinite(outcome.error).all():
             estimate = self.delivered.estimate
             covariance = self.task.estimator.covariance(estimate)
             mean = self.task.estimator.mean(estimate)
@@ -201,7 +201,7 @@ class EpisodeBatch(Runs):
     def observe(self, local: bool = False) -> NDArray[np.float32]:
         """Return observations (N, entries); NaN in an unfinished run is a ``DivergenceError``."""
         if self._state is self._computed and self._observed is not None:
-            observation = np.ascontiguousarray(self._observed.T)
+            observation = self._observed.T.copy()
         else:
             observation = super().observe(local)
         if not math.isfinite(np.vdot(observation, observation)):
@@ -226,30 +226,31 @@ class EpisodeBatch(Runs):
         self.memory = self.memory.with_states(moving.pop("memory_states"))
         vars(self).update(moving)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_rows": []}  # whose form only the program knows
+    def _make_program(self) -> Any:
+        """Return the step of the backend, ``None`` for NumPy's."""
+        parts = self.task, Memory(self.task, self.memory.owner), self.layout
+        if self.task.backend == "compiled":
+            from fusion_gym.core.compiled import make_step
 
-    def _compiled(self) -> CompiledStep:
-        from fusion_gym.core.compiled import CompiledStep
+            return make_step(*parts)
+        if self.task.backend == "numpy":
+            return None
+        from fusion_gym.core.jitted import JittedStep
 
         if self.memory.parts:
             raise refusal("backend", "jax", "'numpy' with memory or the beliefs of local sensors")
-        return CompiledStep(self.task, Memory(self.task, self.memory.owner), self.layout)
+        return JittedStep(*parts)
 
     def _run_program(self, requests: NDArray[Any]) -> Outcome:
-        """Make both halves of a step under JAX."""
+        """Make both halves of a step by the backend's program."""
         rule, slots = self.task.network.rule, self.task.network.slots
         check_requests(requests, slots * rule.by_channel)
-        program, before = self._program, self._state
-        assert program is not None
-        if before is not self._computed or not self._rows:
-            self._rows = program.pack(self.position())
+        rows, before = self._packed(), self._state
         self.steps = self.steps + 1
         self._move()
-        rows, after = program(self._rows, requests, self.normals())
-        outcome, self._observed = after
-        self._rows = rows
-        self._computed = self._state = Lazy(lambda: program.position(rows).state)
+        rows = self._program(rows, requests, self.normals())
+        outcome, observed = self._program.result(rows)
+        self._set_rows(rows, observed)
 
         def delivered() -> State:
             position = Position(value_of(before), self.price, self.steps, self.limit)
@@ -260,6 +261,27 @@ class EpisodeBatch(Runs):
         self._delivered = Lazy(delivered)
         self.memory.forget()
         return outcome
+
+    def _begin(self, start: Array, noise: Array, runs: NDArray[np.int64] | None) -> None:
+        """Begin episodes in ``runs``, by default in all, by the backend's program."""
+        every = slice(None) if runs is None else runs
+        rows = self._program.begin(start, noise, self.price[every], self.limit[every])
+        if runs is not None:
+            begun, rows = rows, self._packed().copy()
+            rows[runs] = begun
+        self._set_rows(rows, self._program.observation(rows))
+        self.memory.forget()
+
+    def _packed(self) -> Any:
+        """Return the program's rows of the present state."""
+        if self._state is not self._computed:
+            self._rows = self._program.pack(self.position())
+        return self._rows
+
+    def _set_rows(self, rows: Any, observed: NDArray[np.float32]) -> None:
+        """Set the program's rows and observations (entries, N) as the present state."""
+        self._rows, self._observed, program = rows, observed, self._program
+        self._computed = self._state = Lazy(lambda: program.position(rows).state)
 
     def _move(self) -> None:
         """Move to the noise of the next sensing."""

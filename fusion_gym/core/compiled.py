@@ -1,16 +1,23 @@
-"""A step of N runs as one program that JAX compiles.
+"""A step of N runs as a loop in machine code: LLVM compiles JAX's trace of one run.
 
-The import switches JAX to 64 bits and to a persistent compilation cache. The cache's folder is
-JAX's ``jax_compilation_cache_dir``, by default ``~/.cache/fusion-gym/jax``.
+The code is kept in ``~/.cache/fusion-gym/compiled``, so that only the first start needs JAX.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import dataclasses
-import math
+import functools
+import hashlib
+import io
 import os
+import pickle
+import warnings
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,139 +25,202 @@ from numpy.typing import NDArray
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import Branch, Outcome, Position
+from fusion_gym.core.rows import RowStep
 from fusion_gym.core.task import Task
+from fusion_gym.errors import ConfigurationError
 from fusion_gym.importing import require
+from fusion_gym.lowering import Buffer, LoweringError, assembly
 
-require("an environment under JAX", "jax", "jax")
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-from jax._src.xla_bridge import backends_are_initialized  # noqa: E402
+require("backend='compiled'", "compiled", "llvmlite")
+import llvmlite.binding as llvm  # noqa: E402
 
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_cpu_enable_async_dispatch", False)  # threads cost more than a step
-if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-    folder = Path.home() / ".cache" / "fusion-gym" / "jax"
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-# A program whose arrays have at most 512 bytes runs in one thread, twice as fast at one run.
-_ROWS = 64
+_FOLDER = Path.home() / ".cache" / "fusion-gym" / "compiled"
+_PACKAGE = Path(__file__).parent.parent
+_LOADED: dict[str, tuple[Any, int]] = {}  # engines and addresses
 
 
-def register_state(state: Any) -> None:
-    """Register the dataclasses of states with JAX, through tuples and dataclasses."""
-    if isinstance(state, tuple):
-        for part in state:
-            register_state(part)
-    elif dataclasses.is_dataclass(state):
-        names = [field.name for field in dataclasses.fields(state)]
-        if jax.tree_util.all_leaves([state]):
-            jax.tree_util.register_dataclass(type(state), names, [])
-        for name in names:
-            register_state(getattr(state, name))
+def make_step(task: Task, memory: Memory, layout: ObservationLayout) -> CompiledStep | None:
+    """Return the compiled step, or ``None`` with a warning for a task that NumPy alone runs."""
+    try:
+        task.refuse_jax()
+        if memory.parts:
+            raise LoweringError("it has beliefs")
+        return CompiledStep(task, memory, layout)
+    except (ConfigurationError, LoweringError) as error:
+        warnings.warn(f"backend='compiled' runs under NumPy here: {error}", stacklevel=2)
+        return None
 
 
-def refuse_in_forks(owner: type, *methods: str) -> None:
-    """Make methods raise in a fork of a process that has run JAX, whose threads are absent."""
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise RuntimeError(
-            "JAX may hang in a fork of a process that has run it: use the start method 'spawn' or "
-            "backend='numpy'"
-        )
-
-    def forked() -> None:
-        for method in methods if backends_are_initialized() else ():
-            setattr(owner, method, refuse)
-
-    if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=forked)
-
-
-class Result(NamedTuple):
-    """The outcome of a step, and the observations (entries, N) after it."""
-
-    outcome: Outcome
-    observation: NDArray[np.float32]
-
-
-class CompiledStep:
-    """A step and its observation, with few arrays of float64 in and out.
-
-    JAX takes longer to pass many arrays than to compute a step of one run, so the entries of a
-    position are rows of few arrays, of which NumPy's positions have views. A copy begins at
-    :meth:`pack`.
+class CompiledStep(RowStep):
+    """A step in machine code.
 
     Args:
         task: The task.
         memory: A memory without states.
         layout: The layout of the observation.
+
+    Raises:
+        LoweringError: The step has a primitive that is not lowered, or too many instructions.
+        ConfigurationError: JAX is absent, and the code is not in the cache.
     """
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
-        self._runs, self._program = (task, memory, layout), jax.jit(self._trace)
+        super().__init__(task, memory, layout)
+        self._last: tuple[Any, int] = None, 0  # rows and their address
+        self._functions: dict[str, Any] = {}
+        for kind in ("start", "assign" if task.network.rule.by_channel else "request"):
+            self._function(kind)
 
-    def __reduce__(self) -> Any:
-        return type(self), self._runs
+    def begin(self, start: Array, noise: Array, price: Array, limit: NDArray[np.int64]) -> Array:
+        """Return rows of new episodes.
 
-    def __deepcopy__(self, memo: Any) -> CompiledStep:
-        return self  # what it has compiled fits the copy
+        Args:
+            start: Standard normals (channels, N) of the starts of plant and network.
+            noise: Standard normals (channels, N) of the first sensing.
+            price: Price of a token (N,).
+            limit: Step at which the episode ends (N,).
+        """
+        inputs = [np.ascontiguousarray(part) for part in (start, noise, price, limit)]
+        rows = np.empty((len(price), self.width))
+        self._function("start")(len(rows), *(part.ctypes.data for part in (*inputs, rows)))
+        return rows
 
-    def pack(self, position: Position) -> Any:
-        """Return the rows of a position, a list of arrays (rows, N)."""
-        register_state(position)
-        self._position = _Rows(position)
-        return self._position.pack(np, position)
+    def __call__(self, rows: Array, requests: NDArray[Any], noise: Array) -> Array:
+        """Return the rows after a step with requests (sensors, N) and noise (channels, N)."""
+        flags = requests.dtype == np.bool_
+        requests = np.ascontiguousarray(requests, np.bool_ if flags else np.int64)
+        noise, after = np.ascontiguousarray(noise), np.empty(rows.shape)
+        last, address = self._last
+        before = address if rows is last else rows.ctypes.data
+        self._last = after, after.ctypes.data
+        self._function("request" if flags else "assign")(
+            len(after), before, requests.ctypes.data, noise.ctypes.data, self._last[1]
+        )
+        return after
 
-    def __call__(
-        self, rows: list[Any], requests: NDArray[Any], noise: Array
-    ) -> tuple[list[Any], Result]:
-        """Return the rows and the results after a step."""
-        rows, result = self._program(rows, requests, noise)
-        return rows, self._result.unpack(result)
+    def _function(self, kind: str) -> Any:
+        """Return the machine code of a start, or of a step with requests or assigned channels."""
+        if kind not in self._functions:
+            key = self.runs[0], self.runs[1].owner, kind
+            address = _machine_code(key, functools.partial(self._text, kind))
+            pointers = [ctypes.c_void_p] * (5 if kind == "start" else 4)
+            self._functions[kind] = ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(address)
+        return self._functions[kind]
 
-    def position(self, rows: list[Any]) -> Position:
-        """Return the position of rows."""
-        return self._position.unpack(rows)
+    def _text(self, kind: str) -> str:
+        """Return the assembly of a start or step."""
+        require("the first start of backend='compiled'", "compiled", "jax")
+        from fusion_gym.core import jitted
 
-    def _trace(self, rows: Any, requests: Any, noise: Any) -> tuple[list[Any], list[Any]]:
-        runs = Branch(*self._runs, self._position.unpack(rows))
-        outcome = runs.step(requests, noise)
-        result = Result(outcome, runs.observe().T)
-        self._result = _Rows(result)
-        return self._position.pack(jnp, runs.position()), self._result.pack(jnp, result)
+        whole = np.dtype(np.int64)
+        if kind == "start":
+            inputs: Any = self.start_noise, self.noise, np.zeros(1), np.zeros(1, whole)
+            sources = [Buffer(array.dtype, [array]) for array in inputs]
+            function: Any = jitted.start_arrays
+        else:
+            requests = np.zeros((self.runs[0].sensors, 1), whole if kind == "assign" else np.bool_)
+            inputs = self.moved, requests, self.noise
+            kinds = whole if kind == "assign" else np.dtype(np.int8), self.noise.dtype
+            sources = [Buffer(self.noise.dtype, self.moved, self.width)]
+            sources += [Buffer(k, [x]) for k, x in zip(kinds, inputs[1:], strict=True)]
+            function = jitted.step_arrays
+        try:
+            closed = jitted.jax.make_jaxpr(functools.partial(function, self))(*inputs)
+        except Exception as error:  # of a user's plant or estimator
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            raise LoweringError(f"JAX cannot trace it ({text[:200]})") from error
+        return assembly(closed, sources, [Buffer(self.noise.dtype, self.arrays, self.width)])
 
 
-refuse_in_forks(CompiledStep, "__call__")
+# --- code -----------------------------------------------------------------------------------------
 
 
-class _Rows:
-    """The shapes and types of a tree of arrays (…, N), and its form as few arrays (rows, N)."""
+def _machine_code(task: Any, source: Callable[[], str]) -> int:
+    """Return the address of code from this process, from the cache, or compiled of its assembly."""
+    key = _fingerprint(task)
+    if key in _LOADED:
+        return _LOADED[key][1]
+    code = None if key is None else _read(key)
+    if key is None or code is None:
+        text = source()
+        key = key or hashlib.sha256(f"{_surroundings()}{text}".encode()).hexdigest()
+        code = _read(key) or _compile(text)
+        with contextlib.suppress(OSError):
+            _FOLDER.mkdir(parents=True, exist_ok=True)
+            part = _FOLDER / f"{key}.{os.getpid()}"
+            part.write_bytes(hashlib.sha256(code).digest() + code)
+            part.replace(_FOLDER / key)
+    if key not in _LOADED:
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(jit=True))
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        _LOADED[key] = engine, engine.get_function_address("step")
+    return _LOADED[key][1]
 
-    def __init__(self, tree: Any) -> None:
-        leaves, self._tree = jax.tree.flatten(tree)
-        self._leaves: list[tuple[int, slice, tuple[int, ...], Any]] = []
-        array = end = 0
-        for leaf in leaves:
-            rows = math.prod(leaf.shape[:-1])
-            if end and end + rows > _ROWS:
-                array, end = array + 1, 0
-            self._leaves.append((array, slice(end, end + rows), leaf.shape[:-1], leaf.dtype))
-            end += rows
 
-    def pack(self, xp: Any, tree: Any) -> list[Any]:
-        arrays: list[list[Any]] = [[] for _ in range(self._leaves[-1][0] + 1)]
-        for (array, *_), leaf in zip(self._leaves, jax.tree.leaves(tree), strict=True):
-            arrays[array].append(leaf.reshape(-1, leaf.shape[-1]))
-        return [xp.concatenate(rows, dtype=np.float64) for rows in arrays]
+def _read(key: str) -> bytes | None:
+    """Return the whole code of a file, or ``None``."""
+    with contextlib.suppress(OSError):
+        content = (_FOLDER / key).read_bytes()
+        if hashlib.sha256(content[32:]).digest() == content[:32]:
+            return content[32:]
+    return None
 
-    def unpack(self, arrays: list[Any]) -> Any:
-        runs = arrays[0].shape[-1]
-        if isinstance(arrays[0], jax.Array) and not isinstance(arrays[0], jax.core.Tracer):
-            arrays = [np.asarray(array) for array in arrays]
-        leaves = []
-        for array, rows, shape, kind in self._leaves:
-            leaf = arrays[array][rows].reshape(*shape, runs)
-            leaves.append(leaf if kind == np.float64 else leaf.astype(kind))
-        return jax.tree.unflatten(self._tree, leaves)
+
+def _compile(text: str) -> bytes:
+    """Return the object code of a module in assembly."""
+    machine, module = _machine(), llvm.parse_assembly(text)
+    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
+    builder.getModulePassManager().run(module, builder)
+    code: bytes = machine.emit_object(module)
+    return code
+
+
+def _machine(jit: bool = False) -> Any:
+    """Return LLVM's machine for this processor."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target, features = llvm.Target.from_default_triple(), llvm.get_host_cpu_features().flatten()
+    return target.create_target_machine(llvm.get_host_cpu_name(), features, opt=2, jit=jit)
+
+
+@functools.cache
+def _surroundings() -> str:
+    """Return what the code depends on besides the task: versions, sources and processor."""
+    files = sorted(_PACKAGE.rglob("*.py"))
+    sources = [(str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files]
+    libraries = [version(name) for name in ("numpy", "llvmlite")]
+    processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    return repr((sources, libraries, processor))
+
+
+class _Parts(pickle.Pickler):
+    """A pickler of dataclasses by their fields, without what they have cached."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file)
+        self.fast = True  # independent of which objects are the same
+        self.modules: set[str] = set()
+
+    def reducer_override(self, part: Any) -> Any:
+        """Note the module of a class or function, and reduce a dataclass to its fields."""
+        self.modules.add(getattr(part, "__module__", None) or type(part).__module__)
+        if isinstance(part, type) or not dataclasses.is_dataclass(part):
+            return NotImplemented
+        return type(part), tuple(getattr(part, own.name) for own in dataclasses.fields(part))
+
+
+def _fingerprint(task: Any) -> str | None:
+    """Return a hash of a task, or ``None`` if code outside of this package determines it."""
+    pickler = _Parts(file := io.BytesIO())
+    try:
+        pickler.dump(task)
+    except Exception:  # a part cannot be pickled
+        return None
+    if any(
+        name.partition(".")[0]
+        not in ("fusion_gym", "numpy", "builtins", "types", "functools", "copyreg", "collections")
+        for name in pickler.modules
+    ):
+        return None
+    return hashlib.sha256(_surroundings().encode() + file.getvalue()).hexdigest()

@@ -76,7 +76,7 @@ class Task:
         clock: Whether the observation shows the steps left, so that an episode ends by termination.
         own_number: Whether a local sensor observes its own number.
         vector_reward: Whether the environments return the two terms of the reward.
-        backend: ``"numpy"``, or ``"jax"`` for steps that JAX compiles.
+        backend: ``"numpy"``, or ``"jax"`` or ``"compiled"`` for steps that JAX or LLVM compiles.
         nominal_error: Mean squared errors (n,) that scale belief entries
             (:mod:`fusion_gym.core.scale`); ``None`` uses the errors without transmissions.
         settings: The user's options, for reports.
@@ -160,7 +160,7 @@ class Task:
         if self.network.acknowledgement < 1.0:
             self._check_acknowledgements()
         if self.backend == "jax":
-            self._refuse_jax()
+            self.refuse_jax()
 
     @classmethod
     def create(
@@ -292,8 +292,12 @@ class Task:
         if len(law := self.network.delay) > 1:
             raise forbidden("delay", self.settings.get("delay") or law, reason, where)
 
-    def _refuse_jax(self) -> None:
-        """Refuse options that do not run under JAX."""
+    def refuse_jax(self) -> None:
+        """Refuse options that do not run under JAX.
+
+        Raises:
+            ConfigurationError: An option has a value that NumPy alone runs.
+        """
         kind, own = type(self.estimator).__name__, (self.plant, self.estimator)
         fields = [part.numpy_only for part in own if part.numpy_only is not None]
         fields += [*self.plant.nature.departing, *(["memory"] if self.memory else [])]
@@ -305,6 +309,7 @@ class Task:
             raise validation.refusal("system", kind, "an estimator that JAX runs", "under JAX")
         if fields:
             value = self.settings.get(fields[0])
+            value = self.reward.error_kind if fields[0] == "error" else value
             raise validation.refusal(fields[0], value, "the default", "under JAX")
 
 

@@ -171,6 +171,6 @@ def _first(infos: vector.Infos) -> vector.Infos:
         infos: The info of a batch with one run.
     """
     return {
-        key: np.array(value[0]) if value.ndim > 1 or value.dtype == np.bool_ else value[0]
+        key: value[0] if key in vector.NUMBERS else np.array(value[0])
         for key, value in infos.items()
     }

@@ -288,6 +288,9 @@ def reward_space() -> Box:
     return Box(-np.inf, 0.0, (2,), np.float64)
 
 
+NUMBERS = frozenset({"cost", "cost_tokens", "reward_error", "reward_cost"})  # of an info
+
+
 def step_infos(outcome: Outcome) -> Infos:
     """Return the info of a step as arrays with the batch axis first, without masks."""
     return {
@@ -297,7 +300,7 @@ def step_infos(outcome: Outcome) -> Infos:
         "reward_cost": outcome.reward_communication,
         "granted": outcome.granted.T,
         "arrived": outcome.arrived.T,
-        "denied": (outcome.requested & ~outcome.granted).T,
+        "denied": (outcome.requested > outcome.granted).T,
         "squared_error": outcome.squared_error.T,
         "diverged": outcome.diverged,
     }

@@ -195,10 +195,13 @@ ACCESS_OPTIONS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("options", ACCESS_OPTIONS, ids=lambda options: options["access"])
 @pytest.mark.parametrize("name", ["LinearFusion", "CorrelatedTracking", "RemoteEstimation"])
-def test_access_under_jax_is_that_of_numpy(name: str, options: dict[str, Any]) -> None:
+@pytest.mark.parametrize("backend", ["jax", "compiled"])
+def test_access_of_a_backend_is_that_of_numpy(
+    backend: str, name: str, options: dict[str, Any]
+) -> None:
     pytest.importorskip("jax")
     more: dict[str, Any] = {"sensors": 3} if name == "RemoteEstimation" else {}
-    tasks = [task_of(name, backend=kind, **options | more) for kind in ("numpy", "jax")]
+    tasks = [task_of(name, backend=kind, **options | more) for kind in ("numpy", backend)]
     batches = [EpisodeBatch.seeded(task, 4, 3) for task in tasks]
     for request in requests(tasks[0], 4, 8, rate=0.8):
         outcomes = [batch.step(request) for batch in batches]

@@ -241,9 +241,10 @@ def test_sensors_that_decide_locally_leave_the_channels_to_the_network() -> None
 
 @pytest.mark.parametrize("options", [LOSSY, FADING], ids=["independent", "fading"])
 @pytest.mark.parametrize("numbers", [False, True])
-def test_jax_is_numpy(options: dict[str, Any], numbers: bool) -> None:
+@pytest.mark.parametrize("backend", ["jax", "compiled"])
+def test_a_backend_is_numpy(backend: str, options: dict[str, Any], numbers: bool) -> None:
     pytest.importorskip("jax")
-    tasks = [task_of(backend=kind, **options) for kind in ("numpy", "jax")]
+    tasks = [task_of(backend=kind, **options) for kind in ("numpy", backend)]
     batches = [EpisodeBatch.seeded(task, 4, 3) for task in tasks]
     for request in requests(tasks[0], 4, 8, rate=0.8):
         asked = request * [[2], [1], [2]] if numbers else request

@@ -1,0 +1,230 @@
+"""Programs of JAX in machine code, and the cache of their code."""
+
+import ctypes
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import llvmlite.binding as llvm
+import numpy as np
+import pytest
+from jax import lax
+from jax.scipy.special import erf, erfc
+
+import fusion_gym
+import fusion_gym.jax
+from fusion_gym.core import compiled
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.lowering import Buffer, LoweringError, assembly
+
+LINEAR, REMOTE = "fusion_gym/LinearFusion-v2", "fusion_gym/RemoteEstimation-v1"
+VALUES = np.array([-np.inf, -3.5, -1.0, -0.0, 0.0, 0.25, 1.0, 2.0, 7.5, np.inf, np.nan])
+
+
+def run(function: Callable[..., Any], *columns: Any) -> np.ndarray:
+    """The results (entries, N) of a function of columns (entries,), in N = 2 equal runs."""
+    arrays = [np.asarray(column, np.float64)[:, None] for column in columns]
+    closed = jax.make_jaxpr(lambda *x: jnp.atleast_1d(function(*(a[:, 0] for a in x))))(*arrays)
+    real = np.dtype(np.float64)
+    out = np.zeros((closed.out_avals[0].size, 1), closed.out_avals[0].dtype)
+    text = assembly(closed, [Buffer(real, arrays)], [Buffer(real, [out], out.size)])
+    code = compiled._compile(text)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), compiled._machine(jit=True))
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    pointers = [ctypes.c_void_p] * 2
+    step = ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(engine.get_function_address("step"))
+    inputs = np.repeat(np.concatenate(arrays), 2, axis=1)
+    result = np.empty((2, out.size))
+    step(2, inputs.ctypes.data, result.ctypes.data)
+    np.testing.assert_array_equal(result[0], result[1])
+    return result[0]
+
+
+def doubled_or_summed(a: Any) -> Any:
+    return lax.cond(a[0] > 0.0, lambda x: x * 2.0, jnp.cumsum, a)
+
+
+def newton(x: Any) -> Any:
+    """√a by a loop whose length depends on a."""
+    start = jnp.ones(x.shape), x, 0
+    far = lambda s: (jnp.abs(s[0] * s[0] - s[1]) > 1e-14 * s[1]).any() & (s[2] < 60)  # noqa: E731
+    return lax.while_loop(far, lambda s: ((s[0] + s[1] / s[0]) / 2, s[1], s[2] + 1), start)[0]
+
+
+PAIR, FINITE = (VALUES, VALUES[::-1]), VALUES[1:-2]
+MATRIX = np.array([4.0, 1.0, 0.5, 1.0, 3.0, 0.2, 0.5, 0.2, 2.0])
+FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+    "arithmetic": (lambda a, b: jnp.stack((a + b, a - b, a * b, a / b)), PAIR),
+    "nothing times": (lambda a: 0.0 * a, (VALUES,)),
+    "extremes": (lambda a, b: jnp.stack((jnp.maximum(a, b), jnp.minimum(a, b))), PAIR),
+    "comparisons": (
+        lambda a, b: jnp.stack((a < b, a <= b, a == b, a != b, a >= b, a > b)) * 1.0,
+        PAIR,
+    ),
+    "functions": (
+        lambda a: jnp.stack((jnp.exp(-a), erf(a), erfc(a), jnp.expm1(-a), jnp.sin(a), jnp.abs(a))),
+        (FINITE,),
+    ),
+    "roots": (lambda a: jnp.stack((jnp.sqrt(a), jnp.log(a), a**0.3, jnp.log1p(a))), (VALUES[5:9],)),
+    "powers": (lambda a: jnp.stack((a**3, a**-2, a**0, -a)), (VALUES,)),
+    "parts": (lambda a: jnp.stack(jnp.frexp(a)), ([3.0, -0.1, 1e300, 1.0],)),
+    "rounding": (lambda a: jnp.stack((jnp.floor(a), jnp.ceil(a), a % 2.0)), (FINITE,)),
+    "order": (lambda a: jnp.concatenate((jnp.argsort(a), jnp.sort(a))), ([3.0, 1.0, 2.0, 1.0],)),
+    "two keys": (lambda a, b: jnp.lexsort((a, b)), ([3.0, 1.0, 2.0, 1.0], [1.0, 1.0, 0.0, 1.0])),
+    "places": (lambda a: jnp.stack((jnp.argmax(a), jnp.argmin(a))), ([1.0, 5.0, -2.0, 5.0],)),
+    "place of NaN": (lambda a: jnp.argmax(a), ([1.0, np.nan, 9.0, np.nan],)),
+    "sums": (lambda a: jnp.concatenate((a.cumsum(), a.sum()[None])), (FINITE,)),
+    "truth": (lambda a: jnp.stack(((a > 0).any(), (a > 0).all(), ~(a > 0).any())), (FINITE,)),
+    "few": (lambda a, i: a[i.astype(int)], (VALUES[1:6], [3.0, 0.0, 4.0])),
+    "many": (lambda a, i: (a + 0.0)[i.astype(int)], (np.arange(20.0), [19.0, 0.0, 7.0])),
+    "a table": (lambda i: jnp.asarray(np.arange(30.0) ** 2)[i.astype(int)], ([29.0, 3.0],)),
+    "rows": (lambda a, i: a.reshape(4, 3)[i.astype(int), 1:], (np.arange(12.0), [3.0, 1.0])),
+    "pairs": (
+        lambda a, i: jnp.take_along_axis(a.reshape(4, 3), i.astype(int)[:, None], 1),
+        (np.arange(12.0), [2.0, 0.0, 1.0, 2.0]),
+    ),
+    "moves": (lambda a: jnp.pad(a.reshape(3, 4).T[::-1, 1:], ((1, 0), (0, 2))), (np.arange(12.0),)),
+    "cholesky": (lambda a: jnp.linalg.cholesky(a.reshape(3, 3)), (MATRIX,)),
+    "a solution": (
+        lambda a, b: jax.scipy.linalg.solve_triangular(
+            jnp.tril(a.reshape(3, 3)), b.reshape(3, 2), lower=True
+        ),
+        (MATRIX, np.arange(6.0)),
+    ),
+    "a branch": (doubled_or_summed, ([1.0, 2.0],)),
+    "another branch": (doubled_or_summed, ([-1.0, 2.0],)),
+    "a loop": (newton, ([2.0, 9.0],)),
+    "a recursion": (lambda a: lax.scan(lambda c, x: (c * 0.5 + x, c), 0.0, a)[1], (FINITE,)),
+    "choices": (lambda a: jnp.select([a > 1.0, a < 0.0], [a, -a], 7.0), (VALUES,)),
+    "types": (lambda a: a.astype(np.float32) + a.astype(int).astype(np.float32), (FINITE,)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_program_is_that_of_jax(name: str) -> None:
+    function, columns = FUNCTIONS[name]
+    with np.errstate(all="ignore"):
+        expected = np.asarray(function(*map(np.asarray, columns)), np.float64)
+    np.testing.assert_allclose(run(function, *columns), expected.ravel(), rtol=2e-15, atol=1e-300)
+
+
+def test_a_branch_that_is_not_taken_is_not_executed() -> None:
+    """It would not end."""
+
+    def endless(x: Any) -> Any:
+        return lax.while_loop(lambda y: (y == y).any(), lambda y: y + 1.0, x)
+
+    result = run(lambda a: lax.cond(a[0] > 0.0, lambda x: x * 2.0, endless, a), [1.0, 2.0])
+    np.testing.assert_array_equal(result, [2.0, 4.0])
+
+
+def test_an_unknown_primitive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(LoweringError, match="'igamma'"):
+        run(lambda a: jax.scipy.special.gammainc(a, a), [1.0])
+    monkeypatch.setattr("fusion_gym.lowering.MOST_INSTRUCTIONS", 10)
+    with pytest.raises(LoweringError, match="more than 10 instructions"):
+        run(jnp.cumsum, np.arange(12.0))
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache, without what this process has loaded."""
+    monkeypatch.setattr(compiled, "_FOLDER", tmp_path / "cache")
+    monkeypatch.setattr(compiled, "_LOADED", {})
+    return tmp_path / "cache"
+
+
+def rewards(task: Task) -> np.ndarray:
+    batch = EpisodeBatch.seeded(task, 2, 0)
+    return np.array([batch.step(np.array([[True, False], [True, True]])).reward for _ in range(5)])
+
+
+def test_damaged_code_is_compiled_again(cache: Path) -> None:
+    task = fusion_gym.make_task(LINEAR, backend="compiled")
+    expected = rewards(task)
+    files = sorted(cache.iterdir())
+    assert len(files) == 2  # a start and a step
+    for file in files:
+        file.write_bytes(file.read_bytes()[:-9])
+    compiled._LOADED.clear()
+    np.testing.assert_array_equal(rewards(task), expected)
+    assert sorted(cache.iterdir()) == files
+
+
+def test_a_cache_that_cannot_be_written_is_left_alone(cache: Path) -> None:
+    cache.write_text("a file")
+    assert rewards(fusion_gym.make_task(LINEAR, backend="compiled")).all()
+
+
+def test_a_warm_start_needs_no_jax() -> None:
+    lines = (
+        "import sys, gymnasium, fusion_gym",
+        f"env = gymnasium.make('{LINEAR}', backend='compiled')",
+        "env.reset(seed=0), env.step([1, 0])",
+        "print('jax' in sys.modules)",
+    )
+    command = [sys.executable, "-W", "error", "-c", "; ".join(lines)]
+    subprocess.run(command, check=True, capture_output=True)
+    warm = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert warm.stdout.strip() == "False"
+
+
+def test_other_numbers_have_other_code(cache: Path) -> None:
+    every = [
+        rewards(fusion_gym.make_task(LINEAR, backend="compiled", measurement_covariances=v))
+        for v in (1.0, 2.0, 1.0)
+    ]
+    assert (every[0] != every[1]).any()
+    np.testing.assert_array_equal(every[0], every[2])
+    assert len([*cache.iterdir()]) == 4
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "reason"),
+    [
+        ("TobitOscillator-v1", {"memory": True}, "memory = True is not allowed under JAX"),
+        ("LinearFusion-v2", {"delay": 1}, "delay = 1 is not allowed under JAX"),
+        ("LinearFusion-v2", {"filter": "hold"}, "filter = 'hold' is not allowed under JAX"),
+    ],
+)
+def test_numpy_runs_what_is_not_lowered(env_id: str, options: dict[str, Any], reason: str) -> None:
+    with pytest.warns(UserWarning, match=f"^backend='compiled' runs under NumPy here: {reason}"):
+        env = gymnasium.make(f"fusion_gym/{env_id}", backend="compiled", **options)
+    plain = gymnasium.make(f"fusion_gym/{env_id}", **options)
+    for one in (env, plain):
+        one.reset(seed=0)
+        one.action_space.seed(0)
+    action = env.action_space.sample()
+    assert env.step(action)[1] == plain.step(action)[1]
+
+
+def test_resets_of_some_runs_and_restored_runs_are_those_of_numpy() -> None:
+    batches = [
+        EpisodeBatch.seeded(fusion_gym.make_task(LINEAR, backend=backend), 4, 0)
+        for backend in ("numpy", "compiled")
+    ]
+    rng, stored = np.random.default_rng(0), [{}, {}]
+    for step in range(12):
+        requests = rng.random((2, 4)) < 0.5
+        first, second = (batch.step(requests) for batch in batches)
+        np.testing.assert_allclose(second.reward, first.reward, rtol=1e-12)
+        for place, batch in enumerate(batches):
+            if step % 3 == 1:
+                batch.reset(np.array([step % 4, 2]))
+            if step == 4:
+                stored[place] = batch.snapshot()
+                batch.reset(np.array([1]))
+                batch.restore(stored[place])
+            if step == 8:
+                batch.restore(stored[place])
+        np.testing.assert_allclose(batches[1].observe(), batches[0].observe(), rtol=1e-6)
+        batches[1].observe()[:] = np.nan  # the caller's own
+        state = [batch.delivered.estimate.mean for batch in batches]
+        np.testing.assert_allclose(*state, rtol=1e-12)
