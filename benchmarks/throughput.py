@@ -1,12 +1,13 @@
 """Environment steps per second on one processor, everything included, beside the alternatives.
 
-    python -m benchmarks.throughput [--seconds 0.3] [--page]
+    python -m benchmarks.throughput [--seconds 0.1] [--page]
 
 All cells are measured in one run, in turns, and each is the median of its turns. The last column is
 the ratio to ``oscillator.c``, where a C compiler is at hand. ``--page`` writes the table into
 docs/speed.md.
 """
 
+import itertools
 import os
 import shutil
 import subprocess
@@ -36,7 +37,7 @@ from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 PAGE = Path(__file__).parent.parent / "docs" / "speed.md"
 LOOP = Path(__file__).with_name("oscillator.c")
-TURNS, RUNS = 5, (1, 64, 1024, 4096)
+TURNS, RUNS = 9, (1, 64, 1024, 4096)
 RULE = "innovation_threshold:threshold=1.1"
 OPTIONS: tuple[tuple[str, Options], ...] = (
     ("TobitOscillator-v1", {}),
@@ -46,7 +47,7 @@ OPTIONS: tuple[tuple[str, Options], ...] = (
     ("LinearFusion-v2", {}),
     ("RemoteEstimation-v1", {}),
 )
-NUMPY_ONLY: tuple[tuple[str, Options], ...] = (
+OTHERS: tuple[tuple[str, Options], ...] = (
     ("CorrelatedTracking-v1", {}),
     ("CorrelatedTracking-v1", {"fusion": "ci"}),
     ("MarkovJumpTracking-v1", {}),
@@ -74,8 +75,7 @@ def timed(step: Callable[[], object], steps_per_call: int) -> Workload:
 
 def interface(env_id: str, options: Options, runs: int, backend: str) -> Workload:
     """``gym.make`` for one run, else ``gym.make_vec``, with the reset of ended episodes."""
-    if backend == "jax":
-        options = options | {"backend": "jax"}
+    options = options | {"backend": backend}
     if runs > 1:
         mode: Any = "vector_entry_point"
         envs = gymnasium.make_vec(env_id, runs, vectorization_mode=mode, **options)
@@ -95,23 +95,6 @@ def _workload(env: Any, runs: int, step: Callable[[Any], object]) -> Workload:
     actions = [env.action_space.sample() for _ in range(16)]
     count = iter(range(10**12))
     return timed(lambda: step(actions[next(count) % 16]), runs)
-
-
-def noise_given(env_id: str, options: Options, runs: int) -> Workload:
-    """The compiled step of the batch, whose noise is the same in every step."""
-    env = gymnasium.make_vec(
-        env_id, runs, vectorization_mode="vector_entry_point", backend="jax", **options
-    ).unwrapped
-    env.reset(seed=0)
-    batch: Any = env.batch  # type: ignore[attr-defined]
-    requests = np.arange(batch.task.sensors)[:, None] == np.arange(runs) % 3
-    batch.step(requests)
-    program, noise, rows = batch._program, batch.normals().copy(), [batch._rows]
-
-    def step() -> None:
-        rows[0] = program(rows[0], requests, noise)[0]
-
-    return timed(step, runs)
 
 
 def scan(env_id: str, options: Options, runs: int) -> Workload:
@@ -140,7 +123,9 @@ def scan(env_id: str, options: Options, runs: int) -> Workload:
 def sb3(env_id: str, options: Options, runs: int, native: bool = True) -> Workload:
     """The native environment of Stable-Baselines3, or its DummyVecEnv over ``gym.make``."""
     if native:
-        env: VecEnv = fusion_gym.make_sb3_vec_env(env_id, runs, seed=0, stagger=True, **options)
+        env: VecEnv = fusion_gym.make_sb3_vec_env(
+            env_id, runs, seed=0, stagger=True, backend="compiled", **options
+        )
     else:
         env = DummyVecEnv([lambda: gymnasium.make(env_id, **options)] * runs)
         env.seed(0)
@@ -148,6 +133,19 @@ def sb3(env_id: str, options: Options, runs: int, native: bool = True) -> Worklo
     actions = np.random.default_rng(0).integers(0, 2, (16, runs, *(env.action_space.shape or ())))
     count = iter(range(10**12))
     return timed(lambda: env.step(actions[next(count) % 16]), runs)
+
+
+def cartpole() -> Workload:
+    """Gymnasium's CartPole, for the cost of its interface."""
+    env = gymnasium.make("CartPole-v1")
+    env.reset(seed=0)
+    actions = itertools.cycle([0, 1])
+
+    def step() -> None:
+        if env.step(next(actions))[2]:
+            env.reset()
+
+    return timed(step, 1)
 
 
 def filterpy_loop() -> Workload:
@@ -197,6 +195,7 @@ def rows(folder: str) -> Iterator[tuple[str, str, dict[int, Workload]]]:
     if (loop := c_loop(folder)) is not None:
         yield "TobitOscillator-v1", "C loop", {1024: loop}
     yield "TobitOscillator-v1", "FilterPy loop", {1: filterpy_loop()}
+    yield "CartPole-v1 of Gymnasium", "`gym.make`", {1: cartpole()}
     dummy = sb3("fusion_gym/TobitOscillator-v1", {}, 64, native=False)
     yield "TobitOscillator-v1", "SB3 `DummyVecEnv`", {64: dummy}
     device = jax.devices()[0].platform
@@ -204,16 +203,18 @@ def rows(folder: str) -> Iterator[tuple[str, str, dict[int, Workload]]]:
         env_id, label = f"fusion_gym/{name}", _label(name, options)
         kinds: dict[str, Callable[[str, Options, int], Workload]] = {
             "NumPy": partial(interface, backend="numpy"),
+            "compiled": partial(interface, backend="compiled"),
             f"JAX ({device})": partial(interface, backend="jax"),
-            f"JAX ({device}), noise given": noise_given,
             f"JAX ({device}), scan": scan,
-            "SB3 `VecEnv`": sb3,
+            "SB3 `VecEnv`, compiled": sb3,
         }
         for kind, build in kinds.items():
             yield label, kind, {runs: build(env_id, options, runs) for runs in RUNS}
-    for name, options in NUMPY_ONLY:
-        env_id = f"fusion_gym/{name}"
-        yield _label(name, options), "NumPy", {1024: interface(env_id, options, 1024, "numpy")}
+    for name, options in OTHERS:
+        env_id, label = f"fusion_gym/{name}", _label(name, options)
+        for backend, kind in (("numpy", "NumPy"), ("compiled", "compiled")):
+            every = {runs: interface(env_id, options, runs, backend) for runs in (1, 1024)}
+            yield label, kind, every
 
 
 def _label(name: str, options: Options) -> str:
@@ -221,7 +222,7 @@ def _label(name: str, options: Options) -> str:
     return f"{name}, {given}" if given else name
 
 
-def main(seconds: float = 0.3, page: bool = False) -> None:
+def main(seconds: float = 0.1, page: bool = False) -> None:
     """Measure all rows and print the table.
 
     Args:

@@ -19,15 +19,11 @@ from fusion_gym.core.memory import Memory
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import (
-    Branch,
     Lazy,
     Outcome,
-    Position,
     Runs,
-    State,
     advance,
     start_of,
-    value_of,
 )
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
@@ -245,20 +241,13 @@ class EpisodeBatch(Runs):
         """Make both halves of a step by the backend's program."""
         rule, slots = self.task.network.rule, self.task.network.slots
         check_requests(requests, slots * rule.by_channel)
-        rows, before = self._packed(), self._state
+        rows, program = self._packed(), self._program
         self.steps = self.steps + 1
         self._move()
-        rows = self._program(rows, requests, self.normals())
-        outcome, observed = self._program.result(rows)
+        rows = program(rows, requests, self.normals())
+        outcome, observed = program.result(rows)
         self._set_rows(rows, observed)
-
-        def delivered() -> State:
-            position = Position(value_of(before), self.price, self.steps, self.limit)
-            branch = Branch(self.task, self.memory, self.layout, position)
-            branch.deliver(requests)
-            return branch.delivered
-
-        self._delivered = Lazy(delivered)
+        self._delivered = Lazy(lambda: program.delivered(rows))
         self.memory.forget()
         return outcome
 

@@ -7,6 +7,7 @@ JAX's ``jax_compilation_cache_dir``, by default ``~/.cache/fusion-gym/jax``.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -100,7 +101,7 @@ def start_arrays(step: RowStep, noise: Any, first: Any, price: Any, limit: Any) 
     steps: Any = jnp.zeros(len(price), dtype=np.int64)
     position = Position(advance(task, begun, first, steps), price, steps, limit)
     position = map_arrays(jnp.asarray, position)
-    return [*arrays_of(position), *step.outcome, Branch(*step.runs, position).observe()]
+    return [*arrays_of(position), *step.results, Branch(*step.runs, position).observe()]
 
 
 def step_arrays(step: RowStep, arrays: Sequence[Any], requests: Any, noise: Any) -> list[Any]:
@@ -109,4 +110,5 @@ def step_arrays(step: RowStep, arrays: Sequence[Any], requests: Any, noise: Any)
     register_state(step.template)
     branch = Branch(*step.runs, map_arrays(lambda _: next(values), step.template))
     outcome = branch.step(requests, noise)
-    return [*arrays_of(branch.position()), *outcome, branch.observe()]
+    states = arrays_of(branch.position()), outcome, arrays_of(branch.delivered)
+    return [*itertools.chain(*states), branch.observe()]

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from fusion_gym.arrays import Array, arrays_of, map_arrays
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import Outcome, Position, advance, start_of
+from fusion_gym.core.runs import Branch, Outcome, Position, State, advance, start_of
 from fusion_gym.core.task import Task
 
 
 class RowStep:
     """A step between rows (N, entries), and the places of a row's arrays.
 
-    A row has the arrays of a position, the outcome of the step to it, and its observation.
+    A row has the arrays of a position, of the outcome of the step to it and of the state after the
+    delivery, and its observation.
 
     Args:
         task: The task.
@@ -34,18 +35,23 @@ class RowStep:
         number, steps = np.zeros(1), np.zeros(1, dtype=np.int64)
         with np.errstate(all="ignore"):
             state = advance(task, start_of(task, self.start_noise)[0], self.noise, steps)
-        self.template = Position(state, number, steps, steps)
-        flags = np.zeros((task.sensors, 1), np.bool_)
+            self.template = Position(state, number, steps, steps)
+            branch = Branch(*self.runs, self.template)
+            branch.deliver(np.zeros((task.sensors, 1), np.bool_))
+        self._delivered, flags = branch.delivered, np.zeros((task.sensors, 1), np.bool_)
         errors: Any = np.zeros((len(plant.state_names), 1))
         observation = np.zeros((len(layout.names), 1), np.float32)
         self.moved = arrays_of(self.template)
-        self.outcome = [*[number] * 4, *[flags] * 3, errors, errors, *[flags[0]] * 2]
-        self.arrays = [*self.moved, *self.outcome, observation]
+        outcome = [*[number] * 4, *[flags] * 3, errors, errors, *[flags[0]] * 2]
+        self.results = [*outcome, *arrays_of(self._delivered)]
+        self.arrays = [*self.moved, *self.results, observation]
         *self._places, self._entries = _places(self.arrays)
-        self._span = slice(self._places[len(self.moved)].start, self._entries.start)
+        first = len(self.moved)
+        own, self._after = self._places[first : first + len(outcome)], first + len(outcome)
+        self._span = slice(own[0].start, own[-1].stop)
         self._fields = [  # whether a field of the outcome is a flag, and its place
             (array.dtype == np.bool_, place if array.ndim > 1 else place.start)
-            for array, place in zip(self.outcome, _places(self.outcome), strict=True)
+            for array, place in zip(outcome, _places(outcome), strict=True)
         ]
 
     def __reduce__(self) -> Any:
@@ -68,14 +74,22 @@ class RowStep:
 
     def position(self, rows: Array) -> Position:
         """Return the position of rows."""
-        values, places = rows.T, iter(self._places)
+        position: Position = self._unpack(rows, self.template, 0)
+        return position
+
+    def delivered(self, rows: Array) -> State:
+        """Return the states after the delivery of rows."""
+        state: State = self._unpack(rows, self._delivered, self._after)
+        return state
+
+    def _unpack(self, rows: Array, template: Any, first: int) -> Any:
+        values, places = rows.T, iter(self._places[first:])
 
         def part(array: NDArray[Any]) -> NDArray[Any]:
             own = values[next(places)].reshape(*array.shape[:-1], -1)
             return own.astype(array.dtype) if array.dtype != own.dtype else own
 
-        position: Position = map_arrays(part, self.template)
-        return position
+        return map_arrays(part, template)
 
     def result(self, rows: Array) -> tuple[Outcome, NDArray[np.float32]]:
         """Return the outcome and the observations (entries, N) of rows."""
