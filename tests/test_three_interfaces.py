@@ -60,16 +60,17 @@ def arrays_in(value: Any) -> list[NDArray[Any]]:
     return [value] if isinstance(value, np.ndarray) else []
 
 
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
 @pytest.mark.parametrize("interface", ["single", "sb3", *MODES], ids=str)
-def test_returned_arrays_belong_to_the_caller(interface: Any) -> None:
+def test_returned_arrays_belong_to_the_caller(interface: Any, backend: str) -> None:
     """What was returned never changes later, and changing it changes nothing later."""
 
     def make() -> Any:
         if interface == "single":
-            return gymnasium.make(ENV_ID, horizon=3)
+            return gymnasium.make(ENV_ID, horizon=3, backend=backend)
         if interface == "sb3":
-            return fusion_gym.make_sb3_vec_env(ENV_ID, 3, horizon=3)
-        return make_vector(3, interface, horizon=3)
+            return fusion_gym.make_sb3_vec_env(ENV_ID, 3, horizon=3, backend=backend)
+        return make_vector(3, interface, horizon=3, backend=backend)
 
     def reset(env: Any, seed: int | None, over: Any) -> Any:
         if interface == "sb3":

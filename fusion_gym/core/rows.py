@@ -93,7 +93,7 @@ class RowStep:
 
     def result(self, rows: Array) -> tuple[Outcome, NDArray[np.float32]]:
         """Return the outcome and the observations (entries, N) of rows."""
-        numbers = rows.T[self._span]
+        numbers = rows.T[self._span].copy()  # or a stored reward would keep the rows
         both: tuple[Any, Any] = numbers, numbers != 0.0
         outcome = Outcome(*[both[flag][place] for flag, place in self._fields])
         return outcome, self.observation(rows)

@@ -325,8 +325,8 @@ def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:
 
 def _with_mask(infos: Infos, mask: NDArray[np.bool_]) -> Infos:
     """Return the infos in Gymnasium's vector form, each key with its mask of valid runs."""
-    result, mask = {key: value.copy() for key, value in infos.items()}, mask.copy()
-    return result | {f"_{key}": mask for key in infos}
+    result = {key: value.copy() for key, value in infos.items()}
+    return result | {f"_{key}": mask.copy() for key in infos}
 
 
 def _final_infos(infos: Infos, ended: NDArray[np.bool_], observation: NDArray[np.float32]) -> Infos:
