@@ -37,13 +37,12 @@ from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 PAGE = Path(__file__).parent.parent / "docs" / "speed.md"
 LOOP = Path(__file__).with_name("oscillator.c")
-TURNS, RUNS = 9, (1, 64, 1024, 4096)
+TURNS, RUNS = 9, (1, 64, 1024)
 RULE = "innovation_threshold:threshold=1.1"
 OPTIONS: tuple[tuple[str, Options], ...] = (
     ("TobitOscillator-v1", {}),
     ("TobitOscillator-v1", {"filter": "tobit"}),
     ("BiasedOscillator-v1", {"access": "any"}),
-    ("BiasedTracking-v1", {"access": "any"}),
     ("LinearFusion-v2", {}),
     ("RemoteEstimation-v1", {}),
 )
