@@ -120,10 +120,8 @@ class Program:
 
     def run(self, closed: Any, arguments: Iterable[Values]) -> list[Values]:
         """Return the results of a jaxpr."""
-        jaxpr = getattr(closed, "jaxpr", closed)
-        values = dict(
-            zip(jaxpr.constvars, map(_objects, getattr(closed, "consts", ())), strict=True)
-        )
+        jaxpr = closed.jaxpr
+        values = dict(zip(jaxpr.constvars, map(_objects, closed.consts), strict=True))
         values |= zip(jaxpr.invars, arguments, strict=True)
 
         def read(atom: Any) -> Values:

@@ -15,6 +15,7 @@ import pytest
 from test_namespace import SLOW_TASKS, TASKS
 
 import fusion_gym
+from fusion_gym.arrays import arrays_of
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.evaluation import run_episodes
@@ -110,7 +111,7 @@ def test_backend_equals_numpy_and_itself_in_any_batch(
         if step % 40 == 0:  # what is computed on demand
             batches = [env.unwrapped.batch for env in envs[:2]]
             states = [(batch.state, batch.delivered, batch.price, batch.steps) for batch in batches]
-            for a, b in zip(*map(jax.tree.leaves, states), strict=True):
+            for a, b in zip(*map(arrays_of, states), strict=True):
                 np.testing.assert_allclose(
                     np.asarray(b, np.float64), np.asarray(a, np.float64), rtol=close, atol=close
                 )

@@ -107,7 +107,6 @@ def start_arrays(step: RowStep, noise: Any, first: Any, price: Any, limit: Any) 
 def step_arrays(step: RowStep, arrays: Sequence[Any], requests: Any, noise: Any) -> list[Any]:
     """Return the arrays of a row after a step, from a position's arrays, requests and noise."""
     values = iter(arrays)
-    register_state(step.template)
     branch = Branch(*step.runs, map_arrays(lambda _: next(values), step.template))
     outcome = branch.step(requests, noise)
     states = arrays_of(branch.position()), outcome, arrays_of(branch.delivered)
