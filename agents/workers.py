@@ -47,11 +47,6 @@ class Pool:
         """Whether the workers are child processes."""
         return self.backend == "loky"
 
-    def map_unordered(self, function: Callable[[Any], Any], pieces: Sequence[Any]) -> Iterator[Any]:
-        """Yield the results of the pieces in the order of their completion, while connected."""
-        calls = (joblib.delayed(function)(piece) for piece in pieces)
-        yield from joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
-
     @contextlib.contextmanager
     def connect(self) -> Iterator[None]:
         """Connect to the pool for the duration of the context."""
@@ -93,7 +88,8 @@ def run_parallel(work: Sequence[Call], pool: Pool, description: str) -> list[Any
     results: dict[int, Any] = {}
     parent, total = os.getpid() if pool.local else None, sum(call.weight for call in work)
     with progress_bar(100.0, description, unit="%") as bar, pool.connect():
-        pieces = pool.map_unordered(functools.partial(_do, parent), list(enumerate(work)))
+        calls = (joblib.delayed(_do)(parent, item) for item in enumerate(work))
+        pieces = joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
         try:
             for place, result in pieces:
                 results[place] = result

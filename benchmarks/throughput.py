@@ -91,9 +91,8 @@ def interface(env_id: str, options: Options, runs: int, backend: str) -> Workloa
 def _workload(env: Any, runs: int, step: Callable[[Any], object]) -> Workload:
     env.reset(seed=0)
     env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(16)]
-    count = iter(range(10**12))
-    return timed(lambda: step(actions[next(count) % 16]), runs)
+    actions = itertools.cycle([env.action_space.sample() for _ in range(16)])
+    return timed(lambda: step(next(actions)), runs)
 
 
 def scan(env_id: str, options: Options, runs: int) -> Workload:
@@ -129,9 +128,9 @@ def sb3(env_id: str, options: Options, runs: int, native: bool = True) -> Worklo
         env = DummyVecEnv([lambda: gymnasium.make(env_id, **options)] * runs)
         env.seed(0)
     env.reset()
-    actions = np.random.default_rng(0).integers(0, 2, (16, runs, *(env.action_space.shape or ())))
-    count = iter(range(10**12))
-    return timed(lambda: env.step(actions[next(count) % 16]), runs)
+    shape = (16, runs, *(env.action_space.shape or ()))
+    actions = itertools.cycle(np.random.default_rng(0).integers(0, 2, shape))
+    return timed(lambda: env.step(next(actions)), runs)
 
 
 def cartpole() -> Workload:

@@ -22,13 +22,7 @@ from fusion_gym.envs.views import make_view
 from fusion_gym.errors import ConfigurationError
 from fusion_gym.evaluation.metrics import metric_table
 from fusion_gym.fusion.table import RULES
-from fusion_gym.policies.registry import (
-    Kind,
-    make_policy,
-    policy_maker,
-    policy_names,
-    policy_parameters,
-)
+from fusion_gym.policies import registry
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.training.algorithms import algorithm_table
 
@@ -105,7 +99,7 @@ def _runs(letter: str, text: str) -> bool:
     more, policy = _INTERFACES[letter]
     try:
         with warnings.catch_warnings(action="ignore"):
-            make_policy(policy, task_of(f"{text} {more}".strip()))
+            registry.make_policy(policy, task_of(f"{text} {more}".strip()))
     except ConfigurationError:
         return False
     return True
@@ -146,8 +140,8 @@ def policy_table(text: str) -> str:
     """Return the policies of a kind: the columns that the text names after the kind."""
     kind, *columns = text.split()
     rows = []
-    for name in policy_names(cast(Kind, kind)):
-        maker, parameters = policy_maker(name), list(policy_parameters(name))
+    for name in registry.policy_names(cast(registry.Kind, kind)):
+        maker, parameters = registry.policy_maker(name), list(registry.policy_parameters(name))
         knowledge = getattr(maker, "knowledge", None)
         cells = {
             "policy": f"`{name}:{parameters.pop(0).upper()}`" if kind == "agent" else f"`{name}`",

@@ -82,13 +82,18 @@ def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: in
     return result
 
 
+def array_shape(value: Any) -> tuple[int, ...] | None:
+    """Return the shape of a value, or ``None`` for lists of different lengths."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        return None
+
+
 def by_row(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
     """Return one number per row as an array that broadcasts to ``shape``, other values as given."""
-    try:
-        values = np.asarray(value)
-    except ValueError:
-        return value
-    return values.reshape(-1, *[1] * (len(shape) - 1)) if values.shape == shape[:1] else value
+    single = array_shape(value) == shape[:1]
+    return np.reshape(value, (-1, *[1] * (len(shape) - 1))) if single else value
 
 
 def number(

@@ -102,7 +102,7 @@ ADDITIONS = {
         lines=(
             (
                 LINEAR,
-                "    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)",
+                "    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)",
                 "    initial_variance: float = 1.0",
             ),
             (

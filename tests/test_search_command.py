@@ -8,7 +8,7 @@ import pytest
 import yaml
 from command_runs import call, refusal, succeed
 
-from fusion_gym.commands import search as command
+from fusion_gym.evaluation import rule_search
 
 pytest.importorskip("cmaes")
 ENV = "fusion_gym/LinearFusion-v2"
@@ -102,7 +102,7 @@ def test_an_interrupted_search_ends_as_the_uninterrupted_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     succeed("search", words("whole"))
-    searched = command.search_rule
+    searched = rule_search.search_rule
 
     def interrupt(search: Any, earlier: Any, progress: Any) -> Any:
         def count(generation: Any) -> None:
@@ -113,7 +113,7 @@ def test_an_interrupted_search_ends_as_the_uninterrupted_one(
         return searched(search, earlier, count)
 
     with monkeypatch.context() as patch:
-        patch.setattr(command, "search_rule", interrupt)
+        patch.setattr(rule_search, "search_rule", interrupt)
         ended = call("search", words("parts"))
     assert ended.status == 130
     assert ended.err.splitlines()[-1].startswith("interrupted; continue with: fusion-gym search ")

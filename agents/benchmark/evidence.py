@@ -200,21 +200,18 @@ def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> N
     """Train and calibrate the agents of all classes, and the other algorithm's."""
     places = []
     for item in classes:
-        for kind, (algorithm, steps) in suite.algorithms(item.setting, item.name).items():
-            for seed in range(suite.seeds(item.setting, item.name)):
+        own = item.setting, item.name
+        for kind, (algorithm, steps) in suite.algorithms(*own).items():
+            for seed in range(suite.seeds(*own)):
                 folder = f"{item.setting.name}_{item.name}_{algorithm.name}_{seed}"
-                experiment = suite.experiment(
-                    item.setting, item.name, item.prices, seed, algorithm, steps
-                )
+                experiment = suite.experiment(*own, item.prices, seed, algorithm, steps)
                 job = TrainingJob(
-                    item.setting, item.name, experiment, item.prices, item.rule,
-                    suite.calibration_episodes, runner.folder / "agents" / folder,
+                    *own, experiment, item.prices, item.rule, suite.calibration_episodes,
+                    runner.folder / "agents" / folder,
                 )  # fmt: skip
                 places.append((item, kind, job))
-    jobs = [job for _, _, job in places]
-    for (item, kind, job), result in zip(
-        places, runner.run(run_training, jobs, "trainings"), strict=True
-    ):
+    results = runner.run(run_training, [job for _, _, job in places], "trainings")
+    for (item, kind, job), result in zip(places, results, strict=True):
         item.trainings.setdefault(kind, []).append((job, result))
 
 
@@ -226,9 +223,8 @@ def test_all(
         item.test(texts, suite.episodes, item.setting.trigger.case if kind == "trigger" else None)
         for item, kind, texts in places
     ]
-    for (item, kind, _), outcomes in zip(
-        places, runner.run(verdict.run_test, jobs, "tests"), strict=True
-    ):
+    results = runner.run(verdict.run_test, jobs, "tests")
+    for (item, kind, _), outcomes in zip(places, results, strict=True):
         item.tests.setdefault(kind, []).append(outcomes)
 
 
@@ -337,18 +333,16 @@ def class_rows(classes: Sequence[Evidence]) -> list[ClassRow]:
     """
     rows = []
     for item in classes:
-        (reference,) = item.tests[REFERENCE]
+        (reference,), place = item.tests[REFERENCE], (item.setting.name, item.name)
         for kind, every in item.tests.items():
             if kind != REFERENCE:
                 d = mean_difference([(every, reference)])
                 median = float(np.median([mean_difference([([o], reference)]).mean for o in every]))
-                rows.append(
-                    ClassRow(item.setting.name, item.name, kind, d.mean, d.low, d.high, median)
-                )
+                rows.append(ClassRow(*place, kind, d.mean, d.low, d.high, median))
         if item.bounds:
             costs = [float(outcome.cost.mean()) for outcome in reference]
             below = float(np.mean(np.divide(item.bounds, costs))) - 1.0
-            rows.append(ClassRow(item.setting.name, item.name, "bound", below, below, below, below))
+            rows.append(ClassRow(*place, "bound", below, below, below, below))
     return rows
 
 
@@ -378,13 +372,10 @@ def training_rows(classes: Sequence[Evidence]) -> list[TrainingRow]:
                     for name in (kind, CALIBRATED[kind])
                 )
                 rule_only = sum(point.mixture == 1.0 for point in result.points)
-                rows.append(
-                    TrainingRow(
-                        item.setting.name, item.name, kind, job.experiment.algorithm.name, seed,
-                        job.experiment.training.timesteps, result.seconds,
-                        result.calibration_seconds, rule_only, agent, learned,
-                    )
-                )  # fmt: skip
+                algorithm, training = job.experiment.algorithm.name, job.experiment.training
+                seconds = result.seconds, result.calibration_seconds
+                own = algorithm, seed, training.timesteps, *seconds, rule_only, agent, learned
+                rows.append(TrainingRow(item.setting.name, item.name, kind, *own))
     return rows
 
 

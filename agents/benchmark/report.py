@@ -157,17 +157,11 @@ def headline_text(settings: Sequence[Setting], rows: Sequence[evidence.SavingRow
     """Return the table of what thresholds, search and learning save, a row for each setting."""
     kinds = "threshold", "rule", "learned"
     by_kind = {(row.setting, row.kind): row for row in rows}
-    cells = (
-        (
-            setting.title,
-            setting.trigger_title,
-            *(
-                interval(row, row.saving).removeprefix("+")
-                for row in (by_kind[setting.name, kind] for kind in kinds)
-            ),
-        )
-        for setting in settings
-    )
+    cells = []
+    for setting in settings:
+        own = (by_kind[setting.name, kind] for kind in kinds)
+        savings = (interval(row, row.saving).removeprefix("+") for row in own)
+        cells.append((setting.title, setting.trigger_title, *savings))
     labels = {kind: STYLES[kind].label for kind in kinds}
     medians = {
         kind: f"{100.0 * np.median([r.saving for r in rows if r.kind == kind] or [np.nan]):.1f}"
@@ -353,9 +347,8 @@ def draw_headline(results: Results, titles: dict[str, str], path: Path) -> None:
         label, colour, marker = STYLES[kind]
         dash = "--" if kind == "bound" else "-"
         panel.plot(prices, costs, dash, color=colour, marker=marker, label=label)
-    for (price, trigger, *_), (_, learned, *_) in zip(
-        lines["trigger"].T, lines["learned"].T, strict=True
-    ):
+    pairs = zip(lines["trigger"].T, lines["learned"].T, strict=True)
+    for (price, trigger, *_), (_, learned, *_) in pairs:
         panel.annotate(
             "", (price, learned), (price, trigger),
             arrowprops={"arrowstyle": "->", "color": STYLES["learned"].colour, "linewidth": 0.8},

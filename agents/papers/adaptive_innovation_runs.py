@@ -174,15 +174,12 @@ class ErrorRecord:
     def arrays(self) -> dict[str, Array]:
         """Return all arrays by name."""
         compared = ("encloses", "encloses_plane", "node_bounded")
-        return (
-            {
-                name: value / (self.compared if name in compared else STEPS)
-                for name, value in self.sums.items()
-            }
-            | self.most
-            | {name: np.stack(rows, axis=1) for name, rows in self.rows.items()}
-            | self.stored
-        )
+        means = {
+            name: value / (self.compared if name in compared else STEPS)
+            for name, value in self.sums.items()
+        }
+        series = {name: np.stack(rows, axis=1) for name, rows in self.rows.items()}
+        return means | self.most | series | self.stored
 
     def add(self, step: Step) -> None:
         """Add a step."""

@@ -8,19 +8,7 @@ import jinja2
 import matplotlib.pyplot as plt
 from PIL import Image
 
-from agents.papers.numbers import (
-    DEPENDS,
-    MISPRINT,
-    always,
-    below,
-    by_mean,
-    cite,
-    estimate,
-    number_text,
-    outcome,
-    percent,
-    verdict,
-)
+from agents.papers import numbers
 from agents.papers.paper import NAMES, Data, Paper, PaperFigure
 from fusion_gym.entries import Plain
 from fusion_gym.output import palette
@@ -44,10 +32,13 @@ def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Pl
         result, own = parts, outcomes.setdefault(f"{source}: {text}", {})
         if not isinstance(parts, str):
             cases = parts if isinstance(parts, Mapping) else {"": parts}
-            own |= {f"{reading}: {c}" if c else reading: outcome(v) for c, v in cases.items()}
-            result = verdict(own.values())
+            for case, conditions in cases.items():
+                key = f"{reading}: {case}" if case else reading
+                own[key] = numbers.outcome(conditions)
+            result = numbers.verdict(own.values())
         names = [name.rpartition(": ")[2] for name, value in own.items() if value == 1.0]
-        region = f": holds with {', '.join(dict.fromkeys(names))}" if result == DEPENDS else ""
+        ways = ", ".join(dict.fromkeys(names))
+        region = f": holds with {ways}" if result == numbers.DEPENDS else ""
         row = {"text": text, "source": source, "verdict": result, "evidence": _line(caller())}
         claims.append(row)
         cells = row | {"verdict": f"**{result}**{region}"}
@@ -67,17 +58,17 @@ def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Pl
         }
         text = template.render(
             pieces, paper=paper.name, claim=claim, counts=counts, tally=tally, every=every,
-            misprint=MISPRINT,
+            misprint=numbers.MISPRINT,
         )  # fmt: skip
     lines = text.splitlines()
     tables = [
         {
             "piece": name,
             "name": table,
-            "numbers": [n._asdict() | {"verdict": n.verdict} for n in numbers],
+            "numbers": [n._asdict() | {"verdict": n.verdict} for n in entries],
         }
         for name, piece in pieces.items()
-        for table, numbers in piece.get("tables", {}).items()
+        for table, entries in piece.get("tables", {}).items()
     ]
     return text, {
         "paper": paper.name,
@@ -91,13 +82,13 @@ def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Pl
 
 def write_page(paper: Paper, results: Results, counts: Counts, output: Path) -> Plain:
     """Write a paper's pictures, its page and its numbers, and return the numbers."""
-    text, numbers = render_page(paper, results, counts)
+    text, content = render_page(paper, results, counts)
     for name, figure in paper.figures.items():
         data = results[next(iter(paper.readings))][figure.piece]
         write_figure(figure, data, output / paper.name / name)
     write_text(output / f"{paper.name}.md", text)
-    write(output / f"{paper.name}.json", numbers)
-    return numbers
+    write(output / f"{paper.name}.json", content)
+    return content
 
 
 def write_overview(output: Path) -> None:
@@ -119,14 +110,11 @@ def _template(name: str) -> jinja2.Template:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "cell": _cell, "cite": cite, "line": _line, "number": number_text, "percent": percent,
+        "cell": _cell, "cite": numbers.cite, "line": _line, "number": numbers.number_text,
+        "percent": numbers.percent,
     }  # fmt: skip
-    environment.globals |= {
-        "always": always,
-        "below": below,
-        "by_mean": by_mean,
-        "estimate": estimate,
-    }
+    functions = numbers.always, numbers.below, numbers.by_mean, numbers.estimate
+    environment.globals |= {function.__name__: function for function in functions}
     return environment.get_template(name)
 
 

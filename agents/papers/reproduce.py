@@ -20,14 +20,8 @@ from typing import Annotated, Any
 import tyro
 
 from agents.cache import Cache
+from agents.papers import page
 from agents.papers.numbers import LARGER, UNDECIDED
-from agents.papers.page import (
-    draw_figure,
-    render_page,
-    write_figure,
-    write_overview,
-    write_page,
-)
 from agents.papers.paper import (
     NAMES,
     NOTHING,
@@ -105,18 +99,18 @@ class Reproduce(Long):
             for factor in (1.0, LARGER):
                 undecided = []
                 for paper, results, counts in self._judge(papers, factor):
-                    claims = write_page(paper, results, counts, output)["claims"]
+                    claims = page.write_page(paper, results, counts, output)["claims"]
                     print(f"{paper.name}: {output / paper.name}.md")
                     if UNDECIDED in {claim["verdict"] for claim in claims}:
                         undecided.append(paper)
                 papers = undecided
-            write_overview(output)
+            page.write_overview(output)
 
     def _check_verdicts(self, papers: list[Paper], output: Path) -> None:
         with ended_like_by_ctrl_c(), lock_folder(self.work, "work"):
             differing = []
             for paper, results, counts in self._judge(papers, _SHARE):
-                own = render_page(paper, results, counts)[1]["claims"]
+                own = page.render_page(paper, results, counts)[1]["claims"]
                 stored = read_json(output / f"{paper.name}.json", "numbers")["claims"]
                 for new, old in zip(own, stored, strict=True):
                     same = new["verdict"] in (old["verdict"], UNDECIDED)
@@ -158,7 +152,7 @@ class Reproduce(Long):
         path = (self.output or Path("runs/figures")) / paper.name / name
         with ended_like_by_ctrl_c(), lock_folder(self.work, "work"):
             job = self._job(paper.piece(figure.piece), settings, figure.restriction)
-            write_figure(figure, self._simulate([job])[0], path)
+            page.write_figure(figure, self._simulate([job])[0], path)
         print(f"{paper.name}: {path}.png")
 
     def _job(
@@ -199,4 +193,4 @@ def reproduce_figure(
     settings, piece = item.settings(changes, drawing.without), item.piece(drawing.piece)
     count = integer("episodes", piece.usual if episodes is None else episodes, at_least=2)
     first = integer("seed", seed, at_least=0)
-    return draw_figure(drawing, piece.simulate(count, first, settings, **drawing.restriction))
+    return page.draw_figure(drawing, piece.simulate(count, first, settings, **drawing.restriction))

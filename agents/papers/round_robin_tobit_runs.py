@@ -8,7 +8,7 @@ import numpy as np
 
 import fusion_gym
 from agents.papers.numbers import Number
-from agents.papers.walk import walk, walk_in_parts
+from agents.papers.walk import record, walk_in_parts
 from fusion_gym import gaussian
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -56,11 +56,7 @@ def node_squares(task: Task, policy: Policy | str, episodes: int, seed: int) -> 
 
 def held_values(task: Task, policy: str, seed: int) -> Array:
     """Return the estimators' values (H, sensors) in the first run, by equation (4)."""
-    rows: list[Array] = []
-    for batch, requests in walk(task, policy, 1, seed):
-        batch.step(requests)
-        rows.append(batch.delivered.estimate.held[:, 0, 0].copy())
-    return np.array(rows)
+    return record(task, policy, 1, seed, lambda state: state.estimate.held[:, 0, 0])
 
 
 def resampled(episodes: int) -> Array:
@@ -139,12 +135,8 @@ def floor(env: str, **options: Any) -> list[float]:
     """
     task = fusion_gym.make_task(env, filter="kalman", **(FREE | options))
     policy = "always" if task.network.access == "any" else "round_robin"
-    deviations = []
-    for batch, requests in walk(task, policy, 1, 0):
-        batch.step(requests)
-        covariance = task.estimator.covariance(batch.delivered.estimate)
-        deviations.append(np.sqrt(np.diagonal(covariance[..., 0])))
-    return [float(value) for value in np.array(deviations).mean(0)]
+    covariances = record(task, policy, 1, 0, lambda s: task.estimator.covariance(s.estimate))
+    return np.sqrt(np.diagonal(covariances[..., 0], axis1=1, axis2=2)).mean(0).tolist()
 
 
 class Comparison(NamedTuple):

@@ -11,7 +11,7 @@ from agents.papers import round_robin_tobit_runs as measures
 from agents.papers.numbers import Number, always, grid
 from agents.papers.paper import Data, Settings
 from agents.papers.round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, censored
-from agents.papers.walk import SomeSensors, walk
+from agents.papers.walk import SomeSensors, record, walk
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -111,11 +111,9 @@ def _fusion(episodes: int, seed: int) -> Plain:
     """Return the change of the fused estimate with the shares ε, and with B = 0 with the bias."""
 
     def means(policy: str = "round_robin", **options: Any) -> Array:
-        task, rows = fusion_gym.make_task(OSCILLATOR, **options), []
-        for batch, requests in walk(task, policy, episodes, seed):
-            batch.step(requests)
-            rows.append(np.array(task.estimator.mean(batch.delivered.estimate)))
-        return np.array(rows)
+        task = fusion_gym.make_task(OSCILLATOR, **options)
+        mean = task.estimator.mean
+        return record(task, policy, episodes, seed, lambda state: mean(state.estimate))
 
     split = np.array([means(information_shares=shares) for shares in SHARES])
     no_bias: Options = {"access": "any", "bias_gain": [[0.0], [0.0]]}

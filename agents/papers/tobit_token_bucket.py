@@ -5,7 +5,6 @@ Source: tobit_token_bucket, Section 4.
 
 from collections.abc import Sequence
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -380,5 +379,5 @@ PAPER = Paper(
         *("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial"),
         *("process_noise", "process_variance", "measurement_variance"),
     ),
-    {name: MappingProxyType(options) for name, options in READINGS.items()},
+    READINGS,
 )

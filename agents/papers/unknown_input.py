@@ -5,7 +5,6 @@ Source: unknown_input, Section 4.
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from agents.papers import unknown_input_recursion as recursion
 from agents.papers.drawing import legend, set_ticks
 from agents.papers.numbers import below, estimate, grid
 from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
-from agents.papers.unknown_input_recursion import EXACT_CUTOFF
 from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -258,7 +256,7 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
     node, trace, hidden = [], [], []
     for reading in recursion.UNKNOWN_INPUT_READINGS.values():
         options, policy = reading.get("options", {}), reading.get("policy", TRIGGER)
-        cutoff = reading.get("cutoff", EXACT_CUTOFF)
+        cutoff = reading.get("cutoff", recursion.EXACT_CUTOFF)
         options = _options_of(PRINTED, settings) | options
         record, every = _recursion(PRINTED, policy, episodes, seed, cutoff, **options)
         estimates = [np.moveaxis(each["estimate"], 1, 2) for each in every]
@@ -294,7 +292,7 @@ def _recursion(
     policy: str,
     episodes: int,
     seed: int,
-    cutoff: float = EXACT_CUTOFF,
+    cutoff: float = recursion.EXACT_CUTOFF,
     **options: Any,
 ) -> tuple[Record, list[dict[str, Array]]]:
     """Return a run, and the printed filter of each node on the trigger's deliveries."""
@@ -482,5 +480,5 @@ PAPER = Paper(
     {"policy": Parameter(TRIGGER, checks.policy_of(TRIGGER))},
     (*("horizon", "rho_bar", "rho_initial", "adaptation"),
      *("input_signal", "input_amplitude", "input_period")),
-    {name: MappingProxyType(options) for name, options in READINGS.items()},
+    READINGS,
 )  # fmt: skip

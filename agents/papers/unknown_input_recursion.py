@@ -144,13 +144,8 @@ def decoupling(paper: DrivenPlant, every_step: DrivenPlant) -> Plain:
 
 def _floor(plant: DrivenPlant) -> list[list[float]]:
     """Return mean squared errors (l, 2) of C⁻¹ y, the only estimate that (14) allows."""
-    dynamics, sensors = plant.dynamics, plant.sensors
-    a, b, w = (
-        matrix[..., 0]
-        for matrix in (dynamics.transition, dynamics.input_matrix, dynamics.process_covariance)
-    )
     result = []
-    for c, v in zip(sensors.measurement_matrix[..., 0], sensors.covariance[..., 0], strict=True):
+    for a, b, w, c, v, *_ in models(plant, 1.0, 0.0):
         spread = np.linalg.inv(c) @ v @ np.linalg.inv(c).T
         into = np.linalg.inv(b)
         inputs = into @ (spread + a @ spread @ a.T + w) @ into.T

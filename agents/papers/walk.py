@@ -1,10 +1,11 @@
 """The loop over the steps of episodes of all papers, and policies of some sensors."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -39,6 +40,17 @@ def walk_in_parts(
         count = min(BATCH, episodes - first)
         for step, (batch, requests) in enumerate(walk(task, policy, count, seed + first)):
             yield step, slice(first, first + count), batch, requests
+
+
+def record(
+    task: Task, policy: Policy | str, episodes: int, seed: int, values: Callable[[Any], Any]
+) -> NDArray[Any]:
+    """Return ``values`` of the state after each delivery, times first."""
+    rows = []
+    for batch, requests in walk(task, policy, episodes, seed):
+        batch.step(requests)
+        rows.append(np.array(values(batch.delivered)))
+    return np.array(rows)
 
 
 @dataclass

@@ -29,13 +29,7 @@ from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
 from fusion_gym.envs.registration import class_name, make_task
-from fusion_gym.evaluation.envelope import (
-    FAR_APART,
-    BaselineComparison,
-    PriceComparison,
-    compare_at_price,
-    compare_with_envelope,
-)
+from fusion_gym.evaluation import envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, run_several
 from fusion_gym.output import figures, tables
 from fusion_gym.output.files import write
@@ -121,8 +115,10 @@ def compare(
     points = []
     for name, item in results.items():
         means = float(item.rate.mean()), float(item.mse.mean())
-        at_price = compare_at_price(item, baselines, policies[name])
-        points.append(Point(name, *means, at_price, compare_with_envelope(item, baselines)))
+        at_price = envelope.compare_at_price(item, baselines, policies[name])
+        points.append(
+            Point(name, *means, at_price, envelope.compare_with_envelope(item, baselines))
+        )
     report = evaluation_report(env_id, task, episodes, seed, baselines | results)
     write(folder / "evaluation.json", report)
     write(folder / "comparison.json", {"points": [point.plain() for point in points]})
@@ -173,8 +169,8 @@ class Point(NamedTuple):
     policy: str
     rate: float
     mse: float
-    at_price: PriceComparison
-    at_rate: BaselineComparison
+    at_price: envelope.PriceComparison
+    at_rate: envelope.BaselineComparison
 
     def plain(self) -> Plain:
         """Return the point as JSON."""
@@ -228,5 +224,5 @@ def rate_table(points: Sequence[Point]) -> Table:
     heads = "rate", "its MSE", "envelope's MSE", "difference [95 %]", "relative"
     title = f"at equal rate: {label}, and the baselines' lower envelope at the same rate"
     far = any(point.at_rate.far_apart for point in points)
-    note = f"* between baselines whose rates differ by more than {FAR_APART:g} times"
+    note = f"* between baselines whose rates differ by more than {envelope.FAR_APART:g} times"
     return tables.table_tables(title, ("envelope between", *heads), rows, note if far else None)

@@ -20,15 +20,8 @@ from fusion_gym.commands.options import Episodes, OutputFile, Seed
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments, Plain
 from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation import metrics
 from fusion_gym.evaluation.episodes import BATCH, EpisodeResults, run_episodes, run_several
-from fusion_gym.evaluation.metrics import (
-    METRICS,
-    Interval,
-    mean_interval,
-    paired_difference,
-    robust_summary,
-    summarise,
-)
 from fusion_gym.output import tables
 from fusion_gym.output.files import check_inputs, read_json, write
 from fusion_gym.output.progress import progress_bar, remark, writing
@@ -50,7 +43,8 @@ class Quantiles(pydantic.BaseModel):
 # A policy in the JSON of an evaluation: an interval for a metric, or a list.
 _Row = Annotated[list[float], pydantic.Field(min_length=1)]
 _FIELDS: Arguments = {
-    name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()
+    name: (_Row if metric.axis else metrics.Interval, ...)
+    for name, metric in metrics.METRICS.items()
 }
 EVALUATED = pydantic.create_model("EVALUATED", **_FIELDS)
 
@@ -122,14 +116,14 @@ class Evaluate(EnvironmentOptions, Long):
                 every = run_several(task, built, self.episodes, self.seed, bar.update)
                 for name, result in zip(some, every, strict=True):
                     results[name] = result
-                    report["policies"][name] = summarise(result)
-                    report["quantiles"][name] = robust_summary(result)
+                    report["policies"][name] = metrics.summarise(result)
+                    report["quantiles"][name] = metrics.robust_summary(result)
                     warn_of_draws(name, task, policies[name], result, self.seed)
                 write(self.json, report)
         for part in ("policies", "quantiles"):  # in the order of the command line
             report[part] = {name: report[part][name] for name in names}
         differences = {
-            name: paired_difference(result, results[self.reference])
+            name: metrics.paired_difference(result, results[self.reference])
             for name, result in results.items()
             if self.reference and name != self.reference
         }
@@ -160,7 +154,7 @@ def warn_of_draws(
     drawn = make_policy(f"{name},deterministic=false", task)
     episodes = min(results.episodes, _DRAWN)
     returns = run_episodes(task, drawn, episodes, seed).returns
-    difference = mean_interval(returns - results.returns[:episodes])
+    difference = metrics.mean_interval(returns - results.returns[:episodes])
     if difference.low > 0.0 or difference.high < 0.0:
         remark(
             f"{name} takes its likeliest actions; drawn actions change the return by "
@@ -180,8 +174,8 @@ def evaluation_report(
         "horizon": task.horizon,
         "settings": task.settings,
         "states": list(task.plant.state_names),
-        "policies": {name: summarise(result) for name, result in results.items()},
-        "quantiles": {name: robust_summary(result) for name, result in results.items()},
+        "policies": {name: metrics.summarise(result) for name, result in results.items()},
+        "quantiles": {name: metrics.robust_summary(result) for name, result in results.items()},
     }
 
 

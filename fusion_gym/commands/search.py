@@ -26,14 +26,7 @@ from fusion_gym.commands.options import OUTPUT_FOLDER, whole
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options, Plain
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.rule_search import (
-    ClassName,
-    Generation,
-    RuleSearch,
-    SearchResult,
-    search_of_class,
-    search_rule,
-)
+from fusion_gym.evaluation import rule_search
 from fusion_gym.output import tables
 from fusion_gym.output.files import check_inputs, folder_refusal, lock_folder, read_json, write
 from fusion_gym.output.progress import progress_bar, writing
@@ -50,7 +43,7 @@ class Search(EnvironmentOptions, Long):
 
     output: Annotated[Path, OUTPUT_FOLDER]
     """Folder of the search."""
-    class_name: Annotated[ClassName, tyro.conf.arg(name="class")] = "scheduler"
+    class_name: Annotated[rule_search.ClassName, tyro.conf.arg(name="class")] = "scheduler"
     """Who decides: a scheduler with all measurements, every sensor locally, or the centre."""
     prices: Annotated[int, whole(2, 100)] = 5
     """Number of prices of a token, from the lowest to the highest."""
@@ -64,7 +57,9 @@ class Search(EnvironmentOptions, Long):
         env_id, options = self.environment()
         task = make_task(env_id, **options)
         prices = token_prices(env_id, options, task, self.prices)
-        search = search_of_class(self.class_name, task, prices, generations=self.generations)
+        search = rule_search.search_of_class(
+            self.class_name, task, prices, generations=self.generations
+        )
         make_policy(search.text, task)  # refuses before it creates a folder
         inputs: Plain = {"env": env_id, "class": self.class_name, "prices": search.prices}
         inputs |= {"generations": self.generations, "settings": search.task.settings}
@@ -76,12 +71,12 @@ class Search(EnvironmentOptions, Long):
         print(result.policy)
         tables.console().print(result_table(env_id, result))
 
-    def continued(self, search: RuleSearch, inputs: Plain) -> SearchResult:
+    def continued(self, search: rule_search.RuleSearch, inputs: Plain) -> rule_search.SearchResult:
         """Run the search after its earlier generations, and write every generation to the file."""
         generations = self.earlier(inputs)
         initial = len(generations)
 
-        def keep(*more: Generation) -> None:
+        def keep(*more: rule_search.Generation) -> None:
             generations.extend(more)
             plain = [asdict(generation) for generation in generations]
             write(self.output / _GENERATIONS, {"inputs": inputs, "generations": plain})
@@ -89,14 +84,14 @@ class Search(EnvironmentOptions, Long):
         keep()
         with progress_bar(self.generations, "searching", initial, unit="generations") as bar:
 
-            def progress(generation: Generation) -> None:
+            def progress(generation: rule_search.Generation) -> None:
                 keep(generation)
                 bar.say(f"best {min(generation.objectives) - 1.0:+.1%} over a single threshold")
                 bar.update()
 
-            return search_rule(search, tuple(generations), progress)
+            return rule_search.search_rule(search, tuple(generations), progress)
 
-    def earlier(self, inputs: Plain) -> list[Generation]:
+    def earlier(self, inputs: Plain) -> list[rule_search.Generation]:
         """Return the generations in the folder, of the same search."""
         path = self.output / _GENERATIONS
         if not self.resume:
@@ -109,7 +104,7 @@ class Search(EnvironmentOptions, Long):
         content = read_json(path, "output")
         check_inputs(inputs, content.get("inputs"), f"the search in {str(self.output)!r}")
         source = f"output = {str(path)!r}"
-        result = checked(list[Generation], content.get("generations"), source)
+        result = checked(list[rule_search.Generation], content.get("generations"), source)
         numbers = [generation.number for generation in result]
         if numbers != list(range(min(len(numbers), self.generations))):
             raise ConfigurationError(f"{source} does not hold the first generations of a search")
@@ -131,7 +126,7 @@ def token_prices(env_id: str, options: Options, task: Task, count: int) -> tuple
     return tuple(float(f"{price:.5g}") for price in np.geomspace(*span, count))
 
 
-def result_table(env_id: str, result: SearchResult) -> Table:
+def result_table(env_id: str, result: rule_search.SearchResult) -> Table:
     """Return the table of the costs of a searched rule and of the best single thresholds."""
     columns = result.prices, result.costs, result.threshold_costs
     rows = [

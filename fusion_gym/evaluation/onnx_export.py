@@ -2,7 +2,7 @@
 
 import importlib
 import math
-import time
+import timeit
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,12 +103,8 @@ def latency(graph: DecisionGraph, path: Path) -> Latency:
     arguments = {
         name: value.numpy() for name, value in zip(graph.inputs, graph.example(1), strict=True)
     }
-    seconds = np.empty(_CALLS)
-    for call in range(-_WARM, _CALLS):
-        began = time.perf_counter()
-        run.run(None, arguments)
-        if call >= 0:
-            seconds[call] = time.perf_counter() - began
+    every = timeit.repeat(lambda: run.run(None, arguments), number=1, repeat=_WARM + _CALLS)
+    seconds = every[_WARM:]
     return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)))
 
 

@@ -287,17 +287,12 @@ class SequentialIntersection(SmallestTrace):
             lanes = slice(None) if known and later.all() else runs_of(xp.asarray(later))
             pair = None
             if later.any() if known else steps:
-                pair = self.join(
-                    at_runs(mean, lanes),
-                    at_runs(fused, lanes),
-                    at_runs(means[estimate], lanes),
-                    at_runs(own[estimate], lanes),
-                    None if basis is None else at_runs(basis, lanes),
-                )
-                mean, fused = (
-                    put_runs(mean, lanes, pair.mean),
-                    put_runs(fused, lanes, pair.covariance),
-                )
+                before = at_runs(mean, lanes), at_runs(fused, lanes)
+                new = at_runs(means[estimate], lanes), at_runs(own[estimate], lanes)
+                metric = None if basis is None else at_runs(basis, lanes)
+                pair = self.join(*before, *new, metric)
+                mean = put_runs(mean, lanes, pair.mean)
+                fused = put_runs(fused, lanes, pair.covariance)
             steps.append(_Step(estimate, first, lanes, pair))
         return Fused(mean, fused, lambda: _chained(steps, own.shape, xp))
 

@@ -17,7 +17,6 @@ from fusion_gym.fusion.intersection import (
 )
 from fusion_gym.fusion.rules import FusionRule, InformationFusion, MatrixWeightedFusion
 from fusion_gym.fusion.several import CovarianceIntersection
-from fusion_gym.validation import ConfigurationError
 
 MOST_TOGETHER = 40  # sensors of a rule with cubic cost
 Assumption = Literal[
@@ -153,14 +152,14 @@ def choose_rule(
     rule = RULES[validation.choice("fusion", name, known)]
     if rule.pair and sensors + structure.prediction != 2:
         prediction = " (the centre's prediction is one of them)" if structure.prediction else ""
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"fusion = {name!r} is not allowed with {sensors} sensors: it joins two "
             f"estimates{prediction}; for more it must be 'sici', which joins two at a time"
         )
     if rule.cubic and sensors > MOST_TOGETHER:
         others = [key for key in known if not RULES[key].cubic and not RULES[key].pair]
         instead = f", so it must be {' or '.join(map(repr, others))}" if others else ""
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"fusion = {name!r} is not allowed with {sensors} sensors: it joins the estimates of "
             f"at most {MOST_TOGETHER}, because its cost grows with the cube of their "
             f"number{instead}"

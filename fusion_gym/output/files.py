@@ -123,19 +123,9 @@ def check_inputs(arguments: Mapping[str, Any], earlier: Any, label: str) -> None
     if not then:
         raise ConfigurationError(f"{label} has no record of its inputs")
     for key in dict.fromkeys([*now, *then]):
-        if now.get(key, _ABSENT) != then.get(key, _ABSENT):
-            raise ConfigurationError(
-                f"{key} = {now.get(key, _ABSENT)!r} differs from {label}, which has "
-                f"{then.get(key, _ABSENT)!r}"
-            )
-
-
-class _Absent:
-    def __repr__(self) -> str:
-        return "nothing"
-
-
-_ABSENT = _Absent()
+        if key not in now or key not in then or now[key] != then[key]:
+            ours, earlier = (repr(part[key]) if key in part else "nothing" for part in (now, then))
+            raise ConfigurationError(f"{key} = {ours} differs from {label}, which has {earlier}")
 
 
 def _flat(values: Mapping[str, Any], above: str = "") -> Plain:

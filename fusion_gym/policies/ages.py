@@ -164,9 +164,8 @@ class AgeOptimum(Stateless):
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         place: list[NDArray[np.int64]] = []
-        for source, age, state in zip(
-            self._sources, signals["age"], signals["channel_state"], strict=True
-        ):
+        rows = zip(self._sources, signals["age"], signals["channel_state"], strict=True)
+        for source, age, state in rows:
             place += [_places(source, age), state]
         chosen = self.solution.choice[tuple(place)]
         requests: Requests = (chosen >> np.arange(len(self._sources))[:, None] & 1) == 1

@@ -16,10 +16,11 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import Rows, make_view
+from fusion_gym.errors import forbidden
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.belief_rule import beliefs_of
 from fusion_gym.policies.card import ENTRY, ModelView, algorithm_name, model_card
-from fusion_gym.validation import ConfigurationError, refusal
+from fusion_gym.validation import refusal
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
@@ -77,10 +78,8 @@ class ModelPolicy:
             price = min(max(fixed, span[0]), span[1])
         if price is not None:
             if span is None:
-                raise ConfigurationError(
-                    f"price = {price!r} is not allowed: the model has no price_range, only a "
-                    "single price"
-                )
+                reason = "the model has no price_range, only a single price"
+                raise forbidden("price", price, reason)
             price_setting = Price.create(price, span)
             self.price = float(price_setting.encode(price_setting.draw(np.zeros(1)))[0])
 

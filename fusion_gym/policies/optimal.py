@@ -15,7 +15,6 @@ from fusion_gym.policies.base import Requests, Stateless, check_at_most, stronge
 from fusion_gym.solvers.single import solve_average
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.task import solve_task, source_problems
-from fusion_gym.validation import ConfigurationError
 
 
 class OptimalPolicy(Stateless):
@@ -101,7 +100,7 @@ def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
 
 def _solved(number: int, problem: SourceProblem) -> tuple[Array, Array]:
     if abs(problem.coefficient) > 1.0:
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"coefficient = {problem.coefficient:g} of source {number} is not allowed for the "
             "index: it must be from -1 to 1"
         )
@@ -112,7 +111,7 @@ def _solved(number: int, problem: SourceProblem) -> tuple[Array, Array]:
     prices, thresholds = prices[worth], thresholds[worth]
     grows = bool((thresholds[1:] >= thresholds[:-1]).all())
     if not grows or not all(solution.ordered for solution in solved):
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"source {number} is not allowed for the index: its thresholds must grow with the price"
         )
     return prices, thresholds

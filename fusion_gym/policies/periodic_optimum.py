@@ -17,7 +17,6 @@ from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests, Stateless
 from fusion_gym.systems.correlated.system import CorrelatedTrackingEstimator
-from fusion_gym.validation import ConfigurationError
 
 _MOST = 200_000  # schedules of one search
 _TOGETHER = 4096  # schedules in one batch
@@ -105,7 +104,7 @@ class PeriodicOptimum(Stateless):
         _cycle(task)
         count = math.comb(period * task.sensors, packets)
         if count > _MOST:
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"packets = {packets} with period = {period} and {task.sensors} sensors is not "
                 f"allowed: these are {count} schedules, but the search compares at most {_MOST}; "
                 "use a smaller period"
@@ -228,7 +227,7 @@ def _cycle(task: Task) -> int:
         raise validation.refusal("channel", task.settings["channel"], allowed)
     task.refuse_delay("the schedule supposes arrivals in the step of a request")
     if estimator.covariance_cycle is None:
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(estimator).__name__}: its "
             "covariances must depend only on deliveries, as in MarkovJumpTracking-v1 with "
             "filter='local' or 'centralised', CorrelatedTracking-v1 without a schedule, or "

@@ -16,7 +16,6 @@ from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, check_price, guard, owner_of
 from fusion_gym.policies.belief_rule import beliefs_of, check_owner, knows
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
 
 
 class Imagination:
@@ -39,7 +38,7 @@ class Imagination:
             raise validation.refusal("acknowledgements", value, f"'perfect', because {why}", "here")
         self._of_plant = task.plant.draw_channels
         if self._of_plant is None:
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"{type(task.plant).__name__} is not allowed here: it must offer 'draw', which "
                 "draws the truth and future noise from their distributions"
             )

@@ -294,14 +294,8 @@ def criticise(
         claimed = result.filtered_state_cov[:count, :count]
         known = np.isfinite(values)
         variance = np.diagonal(claimed).clip(0.0)
-        rows.append(
-            Criticism(
-                rate,
-                float((error**2 / scale)[known].mean()),
-                float((variance / scale)[known].mean()),
-                _nees(error, claimed, known & ~sent),
-            )
-        )
+        real, model = (float((s / scale)[known].mean()) for s in (error**2, variance))
+        rows.append(Criticism(rate, real, model, _nees(error, claimed, known & ~sent)))
     return tuple(rows)
 
 

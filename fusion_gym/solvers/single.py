@@ -11,7 +11,6 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import forbidden
 from fusion_gym.solvers.source import ErrorGrid, SourceProblem
-from fusion_gym.validation import ConfigurationError
 
 ChoiceT = TypeVar("ChoiceT")
 
@@ -43,7 +42,7 @@ def iterate_values(
             value = value + (1.0 - laziness) * (change - change.flat[0])
         else:
             value = new - new.flat[0]
-    raise ConfigurationError(
+    raise validation.ConfigurationError(
         f"iterations = {iterations} are not enough: the average cost is only known to lie between "
         f"{lower:.6g} and {upper:.6g}"
     )

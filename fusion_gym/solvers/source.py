@@ -12,7 +12,6 @@ from scipy.special import ndtri
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
-from fusion_gym.validation import ConfigurationError
 
 _MOST_POINTS = 1500
 
@@ -81,11 +80,9 @@ class TokenLevels:
         """Return the reachable levels of the bucket; an unlimited bucket has one level."""
         sensors = len(bucket.cost)
         if sensors > _MOST_SENSORS:
-            raise ConfigurationError(
-                f"sensors = {sensors} is not allowed for the exact optimum under a common bucket: "
-                f"it must be at most {_MOST_SENSORS}, because all 2^{sensors} sets of sensors are "
-                "choices"
-            )
+            why = f"because all 2^{sensors} sets of sensors are choices"
+            where = "for the exact optimum under a common bucket"
+            raise validation.refusal("sensors", sensors, f"at most {_MOST_SENSORS}, {why}", where)
         choices = np.arange(2**sensors)
         sets = (choices >> np.arange(sensors)[:, None] & 1).astype(np.bool_)
         spent = (sets * bucket.cost).sum(0)
@@ -105,7 +102,7 @@ class TokenLevels:
             new = sorted(following - result)
             result |= following
             if len(result) > _MOST_LEVELS:
-                raise ConfigurationError(
+                raise validation.ConfigurationError(
                     f"token_rate = {bucket.rate}, token_capacity = {bucket.capacity} are not "
                     f"allowed for the exact optimum: the bucket must have at most {_MOST_LEVELS} "
                     "levels, so rate, cost and capacity need a common divisor"
@@ -295,7 +292,7 @@ class SourceProblem:
                 break
             if (result - before).max() <= _PRECISION * result.max():
                 return result
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"coefficient = {self.coefficient:g} is not allowed with a loss probability of "
             f"{validation.display(self.drop)}: losses, or waits for tokens, last so long that the "
             "mean squared error of every policy is infinite"

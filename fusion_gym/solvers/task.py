@@ -14,7 +14,6 @@ from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_jo
 from fusion_gym.solvers.single import AverageSolution, FiniteSolution, solve_average, solve_finite
 from fusion_gym.solvers.source import ErrorGrid, SourceProblem, TokenLevels
 from fusion_gym.systems.remote.system import ScalarSources
-from fusion_gym.validation import ConfigurationError
 
 CRITERIA = ("finite", "average")
 
@@ -84,7 +83,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
 
 def _sources(task: Task) -> ScalarSources:
     if not isinstance(task.plant, ScalarSources):
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"plant = {type(task.plant).__name__} is not allowed: it must be remote estimation"
         )
     return task.plant
@@ -118,7 +117,7 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
             spread = float(_sources(task).initial_deviation[i])
             solutions.append(solve_finite(problem, task.horizon, spread))
         if not solutions[-1].ordered:
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 "this task is not solved: its optimum has no thresholds on the error"
             )
     thresholds = [one.threshold.reshape(-1, *one.threshold.shape[-2:]) for one in solutions]

@@ -146,18 +146,11 @@ def scheduled_parts(
 def _steps(field: str, stack: Any) -> int:
     """Return the length of a stack whose entries have one shape."""
     entries = validation.entries(field, stack, "an array", "step")
-    first = _shape(entries[0])
+    first = validation.array_shape(entries[0])
     for step, entry in enumerate(entries):
-        if _shape(entry) != first:
+        if validation.array_shape(entry) != first:
             raise refusal(f"{field} at step {step}", entry, f"an array of shape {first}")
     return len(entries)
-
-
-def _shape(value: Any) -> tuple[int, ...] | None:
-    try:
-        return np.shape(value)
-    except ValueError:
-        return None
 
 
 def _joined(parts: Sequence[Any], hold: bool) -> Any:

@@ -19,14 +19,8 @@ from fusion_gym.evaluation.episodes import run_priced, seeded
 from fusion_gym.evaluation.rule_search import class_of, search_of_class
 from fusion_gym.output.files import replacing
 from fusion_gym.output.progress import progress_bar
+from fusion_gym.policies import calibrated
 from fusion_gym.policies.base import decide
-from fusion_gym.policies.calibrated import (
-    CalibratedPolicy,
-    CalibrationPoint,
-    Mixing,
-    calibration_rule,
-    save_calibrated,
-)
 from fusion_gym.policies.loading import load_model_policy
 
 MIXTURES = 0.0, 0.5, 1.0
@@ -45,18 +39,18 @@ Candidate = tuple[int, float, float]  # agent, μ, c
 class CalibrationRow(NamedTuple):
     """A price: the chosen point, and costs on the tuning episodes of it, rule and best agent."""
 
-    point: CalibrationPoint
+    point: calibrated.CalibrationPoint
     cost: float
     rule_cost: float
     agent_cost: float
 
 
-class _Trial(CalibratedPolicy):
+class _Trial(calibrated.CalibratedPolicy):
     """A calibrated policy with a candidate for each run."""
 
-    candidates: Mixing
+    candidates: calibrated.Mixing
 
-    def at(self, price: Array) -> Mixing:
+    def at(self, price: Array) -> calibrated.Mixing:
         """Return the candidate of each run."""
         return self.candidates
 
@@ -90,7 +84,7 @@ def calibrate(
         name, count = class_of(task, agents[0].view.rows_per_run > 1), (first, max(1, last // 4))
         search = search_of_class(name, task, prices, episodes=count)
         rule = search.rule(search.first_point())
-    trial = _Trial(task, agents, (), calibration_rule(rule, task), ())
+    trial = _Trial(task, agents, (), calibrated.calibration_rule(rule, task), ())
     trial.slopes = fit_slopes(trial, prices, first)
     own = [(number, 0.0, 0.0) for number in range(len(agents))]
     grid = product(range(len(agents)), MIXTURES, THRESHOLDS)
@@ -104,11 +98,13 @@ def calibrate(
             rows.append(_choice(price, finalists, results, len(own)))
             bar.update()
     with replacing(output) as partial:
-        save_calibrated(rule, trial.slopes, [row.point for row in rows], files, partial)
+        calibrated.save_calibrated(rule, trial.slopes, [row.point for row in rows], files, partial)
     return rows
 
 
-def fit_slopes(policy: CalibratedPolicy, prices: Sequence[float], episodes: int) -> list[float]:
+def fit_slopes(
+    policy: calibrated.CalibratedPolicy, prices: Sequence[float], episodes: int
+) -> list[float]:
     """Return each agent's slope of its logit on z; without one, the ratio of deviations."""
     start, samples = seeds.CALIBRATION.start, []
     each = start + np.tile(np.arange(episodes), len(prices))
@@ -138,7 +134,7 @@ def _choice(
     difference = costs[best] - costs[0]
     error = difference.std(ddof=1) / np.sqrt(len(difference))
     chosen = best if difference.mean() + ERRORS * error < 0.0 else 0
-    point = CalibrationPoint(float(price), *finalists[chosen])
+    point = calibrated.CalibrationPoint(float(price), *finalists[chosen])
     return CalibrationRow(point, means[chosen], means[0], means[1 : 1 + agents].min())
 
 

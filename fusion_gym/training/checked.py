@@ -10,7 +10,6 @@ import pydantic
 
 from fusion_gym import validation
 from fusion_gym.errors import display
-from fusion_gym.validation import ConfigurationError
 from fusion_gym.yaml_text import parsed
 
 try:
@@ -74,6 +73,6 @@ def checked(shape: type[Shape], content: Any, source: str) -> Shape:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "the whole file"
         text = "" if first["type"] == "missing" else f" = {display(first['input'])}"
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"{source}: {place}{text} is not allowed: {first['msg']}"
         ) from None

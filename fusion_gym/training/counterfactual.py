@@ -25,7 +25,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.access import channel_requests
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.views import SensorView
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 _CLOSED = -1e8  # the logit of a masked choice
 
@@ -381,10 +381,8 @@ class Decisions:
             self.kind = kind or ("all" if few else "flips")
         form = "assigns channels" if self.assigns else "is one number"
         if kind is not None and kind != self.kind:
-            raise ConfigurationError(
-                f"alternatives = {kind!r} is not allowed here: it must be {self.kind!r}, because "
-                + ("sensors decide locally" if self.local else f"an action {form}")
-            )
+            why = "sensors decide locally" if self.local else f"an action {form}"
+            raise refusal("alternatives", kind, f"{self.kind!r}, because {why}", "here")
         self.choices = self.sensors + 1 if self.assigns else 2
         if self.kind == "all":
             self.choices = 2**self.sensors if self.binary else int(space.n)  # type: ignore[attr-defined]

@@ -18,7 +18,6 @@ from fusion_gym.core.task import Task
 from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.progress import Bar
 from fusion_gym.training import checkpoint, diagnosis
-from fusion_gym.training.checkpoint import Journal, ValidationRecord
 from fusion_gym.training.config import Experiment
 
 
@@ -60,7 +59,7 @@ class Progress(diagnosis.Callback):
         task: Task,
         interrupt: Interrupt,
         bar: Bar,
-        journal: Journal,
+        journal: checkpoint.Journal,
     ) -> None:
         super().__init__()
         self.experiment, self.folder, self.task = experiment, folder, task
@@ -141,7 +140,7 @@ class Progress(diagnosis.Callback):
         scale = self.task.reward.price.scale(
             np.array(self.prices), self.experiment.training.price_exponent
         )
-        record: ValidationRecord = {
+        record: checkpoint.ValidationRecord = {
             "timesteps": self.num_timesteps,
             "return": -self.task.horizon * float((scale * costs).mean()),
             "mse": means.mse,
@@ -198,7 +197,7 @@ class Progress(diagnosis.Callback):
         )
 
 
-def log_line(record: ValidationRecord) -> str:
+def log_line(record: checkpoint.ValidationRecord) -> str:
     """Return a validation in a few words."""
     return f"MSE {record['mse']:.4f}, rate {record['rate']:.3f}"
 

@@ -7,14 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
-from fusion_gym.solvers.silence.lattice import (
-    Coordinates,
-    extents,
-    interpolated,
-    margins,
-    nodes,
-    spread_values,
-)
+from fusion_gym.solvers.silence import lattice
 from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.solvers.silence.survival import Survival
 from fusion_gym.validation import ConfigurationError
@@ -40,7 +33,7 @@ class Stage:
         floor: lower bound of the least cost after a packet, without its price.
     """
 
-    coordinates: Coordinates
+    coordinates: lattice.Coordinates
     step: float
     silent: Array
     gain: Array
@@ -75,13 +68,13 @@ class _Expectation:
         self.stage = stage
         self.deviations = np.sqrt(stage.coordinates.variance) / stage.step
         self.far = stage.ceiling - _TAIL * price
-        self.half = stage.half + margins(self.deviations)
+        self.half = stage.half + lattice.margins(self.deviations)
         self.middle = float(self.values(0 * self.half).item())
         self.rise = max(self.middle - stage.floor, 0.0) + _TAIL * price
 
     def values(self, reach: NDArray[np.int64]) -> Array:
         """Return the expectations at so many points on each side of the middle, by axis (n,)."""
-        gain, added = spread_values(self.stage.gain, self.deviations, reach)
+        gain, added = lattice.spread_values(self.stage.gain, self.deviations, reach)
         return self.stage.ceiling + gain - self.stage.step**2 * added
 
     def within(self, deviations: float) -> Array:
@@ -103,7 +96,7 @@ class _Expectation:
         for place, half in zip(places, self.half, strict=True):
             near &= np.abs(place) <= half
         reach = np.ceil(np.abs(places[:, near]).max(1, initial=0.0)).astype(np.int64)
-        results, parts = interpolated(self.values(reach), places[:, near])
+        results, parts = lattice.interpolated(self.values(reach), places[:, near])
         result = np.full(points.shape[1], self.far)
         result[near] = results - self.stage.step**2 * parts
         return result
@@ -128,7 +121,7 @@ def solve_silence(problem: SilenceProblem, step: float) -> SilenceSolution:
     ahead: _Expectation | None = None
     for time in reversed(range(problem.horizon)):
         noise = problem.noise[time]
-        coordinates = Coordinates.create(survival.curvature, noise)
+        coordinates = lattice.Coordinates.create(survival.curvature, noise)
         half = _half(problem, coordinates, step, ahead)
         points = max(points, int(np.prod(2.0 * half + 1.0)))
         if points > _MOST_POINTS:
@@ -145,12 +138,15 @@ def solve_silence(problem: SilenceProblem, step: float) -> SilenceSolution:
 
 
 def _half(
-    problem: SilenceProblem, coordinates: Coordinates, step: float, ahead: _Expectation | None
+    problem: SilenceProblem,
+    coordinates: lattice.Coordinates,
+    step: float,
+    ahead: _Expectation | None,
 ) -> NDArray[np.int64]:
     """Return the points on each side of the middle that contain every e of optimal silence."""
     price, weight = problem.price, coordinates.basis.T * problem.weights @ coordinates.basis
     if ahead is None:
-        width = extents(weight / price)
+        width = lattice.extents(weight / price)
     else:
         rise = ahead.rise
         to_next = ahead.stage.coordinates.inverse @ problem.transition @ coordinates.basis
@@ -162,20 +158,20 @@ def _half(
             axes = ahead.within(deviations)  # (B, n), several ellipsoids around the others
             again = (to_next.T / axes[:, None] ** 2) @ to_next
             both = _SHARES * weight / (price + rise) + (1.0 - _SHARES) * again
-            near = extents(both).min((0, 1))
-            width = np.minimum(width, np.maximum(extents(weight / returns), near))
+            near = lattice.extents(both).min((0, 1))
+            width = np.minimum(width, np.maximum(lattice.extents(weight / returns), near))
     return np.ceil(width / step).astype(np.int64) + 1
 
 
 def _stage(
     problem: SilenceProblem,
-    coordinates: Coordinates,
+    coordinates: lattice.Coordinates,
     half: NDArray[np.int64],
     step: float,
     ahead: _Expectation | None,
 ) -> Stage:
     """Return the solution one step backwards."""
-    place = nodes(half, step)
+    place = lattice.nodes(half, step)
     error = np.tensordot(coordinates.basis, place, 1)
     silent = np.tensordot(problem.weights, error**2, 1)
     if ahead is not None:

@@ -16,7 +16,6 @@ from fusion_gym.systems.tobit.centre import Centre, NodeCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
-from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def _parts(task: Task) -> tuple[LinearPlant, CensoredSensors]:
     """Return the task's plant and sensors, if the bound applies to them."""
     plant, estimator = task.plant, task.estimator
     if not isinstance(plant, CensoredPlant) or not isinstance(estimator, CensoredEstimator):
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"plant = {type(plant).__name__} is not allowed for the bound: the centre must "
             "estimate a linear plant from all measurements, as in TobitOscillator and the biased "
             "systems"
@@ -85,7 +84,7 @@ def _parts(task: Task) -> tuple[LinearPlant, CensoredSensors]:
     for part in (plant.dynamics, plant.sensors):
         part.refuse_schedule("for the bound")
     if not _predicts(estimator.centre):
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             "filter is not allowed for the bound: in silence the centre must predict, so neither "
             "hold the last value (filter='paper' with silent='hold') nor use the information of "
             "silence (filter='stochastic')"

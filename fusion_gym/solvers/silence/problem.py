@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class SilenceProblem:
         size = len(matrix)
         values = np.asarray(noise, dtype=np.float64)
         if values.ndim != 3 or not len(values):
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"noise of shape {values.shape} is not allowed: it must be (steps, {size}, {size})"
             )
         for covariance in values:

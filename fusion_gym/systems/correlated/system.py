@@ -14,16 +14,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    LOCAL_VARIANCE,
-    Block,
-    age_block,
-    common_signals,
-    log_deviation,
-    numbered,
-    sensed,
-)
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
@@ -140,8 +132,8 @@ class CorrelatedTrackingEstimate(Deliveries):
 
 
 SIGNALS = (
-    *common_signals(prior_covariance="conservative covariance of the prediction"),
-    LOCAL_VARIANCE,
+    *knowledge.common_signals(prior_covariance="conservative covariance of the prediction"),
+    knowledge.LOCAL_VARIANCE,
 )
 
 
@@ -177,11 +169,11 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         return 1 if self.model.period == self.filter.sensors.period == 1 else None
 
     @property
-    def observation(self) -> tuple[Block, ...]:
+    def observation(self) -> tuple[knowledge.Block, ...]:
         """Blocks of the observation."""
-        nodes = numbered(self.filter.sensors.count)
-        block = partial(Block, limit=RANGE)
-        components = (nodes, numbered(self.filter.sensors.size))
+        nodes = knowledge.numbered(self.filter.sensors.count)
+        block = partial(knowledge.Block, limit=RANGE)
+        components = (nodes, knowledge.numbered(self.filter.sensors.size))
         innovation = "innovation of the node over its predicted deviation"
         return (
             block("whitened_innovation", innovation, self._whitened, components, "own", "own"),
@@ -192,17 +184,17 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
                 components,
                 "scheduler",
             ),
-            age_block(nodes),
+            knowledge.age_block(nodes),
             self.deviation_block(
                 "local_log_deviation",
                 "logarithm of the node's predicted over the open-loop deviation",
-                lambda s: log_deviation(s.prior_covariance[1:], self.reference),
+                lambda s: knowledge.log_deviation(s.prior_covariance[1:], self.reference),
                 nodes,
             ),
             self.deviation_block(
                 "log_deviation",
                 "logarithm of the fused predicted over the open-loop deviation",
-                lambda s: log_deviation(s.prior_covariance[0], self.reference),
+                lambda s: knowledge.log_deviation(s.prior_covariance[0], self.reference),
             ),
             self.estimate_block(
                 "fused prediction over the state's root mean square", lambda s: s.prior_mean[0]
@@ -258,7 +250,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
 
         Source: adaptive_innovation, equations (12), (37)-(41) or (47)-(53).
         """
-        outcomes, arrived = sensed(state.outcomes), reception.arrived
+        outcomes, arrived = knowledge.sensed(state.outcomes), reception.arrived
         grant, xp, nodes = arrived[:, None], namespace(arrived), slice(1, None)
         correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
         correction = xp.where(grant, correction, 0.0)
@@ -278,7 +270,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
 
     def read(self, state: CorrelatedTrackingEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
-        outcomes = sensed(state.outcomes)
+        outcomes = knowledge.sensed(state.outcomes)
         return {
             **super().read(state, failure),
             "innovation": lambda: state.measurement - state.expected,
@@ -293,7 +285,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
 
     def single_deliveries(self, state: CorrelatedTrackingEstimate) -> tuple[Array, Array]:
         """See :class:`Estimator`; all sensors' runs are fused at once."""
-        outcomes, count = sensed(state.outcomes), len(state.age)
+        outcomes, count = knowledge.sensed(state.outcomes), len(state.age)
         correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
         means = state.prior_mean[1:] + correction, state.prior_mean[0]
         covariances = outcomes.delivered_covariance, state.prior_covariance[0]
@@ -365,7 +357,7 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
         return self.actual_covariance(state)[0, 0]
 
     def _whitened(self, state: CorrelatedTrackingEstimate) -> Array:
-        deviation = _deviation(sensed(state.outcomes).innovation_covariance)
+        deviation = _deviation(knowledge.sensed(state.outcomes).innovation_covariance)
         return (state.measurement - state.expected) / deviation
 
     def _filters(self, time: Array) -> RobustKalmanFilter:

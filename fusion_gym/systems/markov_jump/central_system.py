@@ -15,15 +15,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    Block,
-    age_block,
-    common_signals,
-    log_deviation,
-    numbered,
-    sensed,
-)
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.markov_jump.centralised import (
     Belief,
@@ -53,7 +46,7 @@ class MarkovJumpCentralEstimate(Deliveries):
 
 
 CENTRAL_SIGNALS = (
-    *common_signals(
+    *knowledge.common_signals(
         "(sensors, 1, N)",
         measurement="the new measurement, or the held one if the sensor does not sample",
         innovation="measurement minus its expectation, 0 if the sensor does not sample",
@@ -86,17 +79,17 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
         return math.lcm(*self.model.sensors.period[:, 0].tolist())
 
     @property
-    def observation(self) -> tuple[Block, ...]:
+    def observation(self) -> tuple[knowledge.Block, ...]:
         """Blocks of the observation; mode probabilities only with interacting models."""
-        nodes, n = numbered(self.model.sensors.count), self.model.plant.size
-        scale, block = self.scale[:, None], partial(Block, limit=RANGE)
+        nodes, n = knowledge.numbered(self.model.sensors.count), self.model.plant.size
+        scale, block = self.scale[:, None], partial(knowledge.Block, limit=RANGE)
         innovation = "innovation against the centre's expectation, whitened, 0 without a sample"
         measured = {"root mean square": self.scale}
-        probability = Block(
+        probability = knowledge.Block(
             "mode_probability",
             "probability of the mode",
             lambda s: s.belief.probability,
-            (numbered(self.model.plant.modes),),
+            (knowledge.numbered(self.model.plant.modes),),
         )
         return (
             block("whitened_innovation", innovation, self._whitened, (nodes,), "scheduler"),
@@ -110,12 +103,12 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
                 constants=measured,
             ),
             *sampling_blocks(self.model.sensors),
-            age_block(nodes),
+            knowledge.age_block(nodes),
             block(
                 "innovation_log_deviation",
                 "logarithm of the innovation's deviation over the measurement's root mean square",
                 lambda s: namespace(s.belief.mean).log(
-                    self._deviation(sensed(s.prediction)) / scale
+                    self._deviation(knowledge.sensed(s.prediction)) / scale
                 ),
                 (nodes,),
                 constants=measured,
@@ -123,11 +116,13 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
             self.deviation_block(
                 "log_deviation",
                 "logarithm of the predicted over the open-loop deviation",
-                lambda s: log_deviation(sensed(s.prediction).covariance[:n, :n], self.reference),
+                lambda s: knowledge.log_deviation(
+                    knowledge.sensed(s.prediction).covariance[:n, :n], self.reference
+                ),
             ),
             self.estimate_block(
                 "prediction over the state's root mean square",
-                lambda s: sensed(s.prediction).mean[:n],
+                lambda s: knowledge.sensed(s.prediction).mean[:n],
             ),
             *((probability,) if isinstance(self.filter, InteractingModels) else ()),
         )
@@ -165,7 +160,7 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
         self, state: MarkovJumpCentralEstimate, reception: Reception
     ) -> MarkovJumpCentralEstimate:
         """Update the centre with all samples that arrive at once."""
-        sensed(state.prediction)
+        knowledge.sensed(state.prediction)
         taken = reception.arrived & self.model.sensors.sampled(state.time)
         # What is not taken counts for nothing, and may be no number where it is not visible.
         after = state.after(taken)
@@ -175,7 +170,7 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
 
     def read(self, state: MarkovJumpCentralEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``CENTRAL_SIGNALS``."""
-        prediction, n = sensed(state.prediction), self.model.plant.size
+        prediction, n = knowledge.sensed(state.prediction), self.model.plant.size
         prior = prediction.covariance[:n, :n]
         return {
             **super().read(state, failure),
@@ -194,7 +189,7 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
         }
 
     def _whitened(self, state: MarkovJumpCentralEstimate) -> Array:
-        prediction = sensed(state.prediction)
+        prediction = knowledge.sensed(state.prediction)
         return self._innovation(state, prediction) / self._deviation(prediction)
 
     def _innovation(self, state: MarkovJumpCentralEstimate, prediction: ModePrediction) -> Array:

@@ -26,7 +26,6 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedMode
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 from fusion_gym.systems.markov_jump.system import FadingPlant, MarkovJumpEstimator
 from fusion_gym.systems.parts import numbered_states
-from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
 FILTERS: dict[str, type] = {
@@ -177,10 +176,8 @@ def _fusion(kind: str | None, where: str, sensors: int, weights: Array | None) -
     """Return the rule that joins the nodes' estimates, or None for a filter at the centre."""
     if where != "local":
         if kind is not None:
-            raise ConfigurationError(
-                f"fusion = {kind!r} is not allowed with filter={where!r}: it must be left out, "
-                "because the centre fuses no estimates; it belongs to filter='local'"
-            )
+            why = "because the centre fuses no estimates; it belongs to filter='local'"
+            raise validation.refusal("fusion", kind, f"left out, {why}", f"with filter={where!r}")
         return None
     kind = "matrix" if kind is None else kind
     return choose_rule(kind, _STRUCTURE, sensors, state_weights=weights)

@@ -17,7 +17,6 @@ from fusion_gym.core.nature import true_motion
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace, ndtr, take
 from fusion_gym.systems.linear_plant import covariance_factor, initial_law
-from fusion_gym.validation import ConfigurationError
 
 Modes = NDArray[np.int64]
 
@@ -124,7 +123,7 @@ class MarkovJumpPlant:
         )
         radius = plant.second_moment_radius()
         if radius >= 1.0 - 1e-9:
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"transitions = {validation.display(matrices)} are not allowed: with this "
                 "mode_transition "
                 "the plant must be mean-square stable, and the spectral radius of its "

@@ -19,7 +19,6 @@ from fusion_gym.namespace import namespace
 from fusion_gym.systems.tobit.filters import Expectation, Outcomes, linear_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
-from fusion_gym.validation import ConfigurationError
 
 # Below this probability of an uncensored value, q counts as this: q enters only in ratios whose
 # limits are reached long before, and 1/q must stay finite.
@@ -178,7 +177,7 @@ class BoundTobitFilter:
         matrices = self.sensors.measurement_matrix[..., 0]
         ranks = np.linalg.matrix_rank(matrices)
         if self.hold and np.any(ranks < self.sensors.size):
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"measurement_matrices with row ranks {ranks.tolist()} are not allowed with "
                 f"filter='paper', silent='hold': each must have its {self.sensors.size} rows "
                 "independent, because the held update (37) has no noise term"

@@ -14,13 +14,7 @@ from fusion_gym.errors import forbidden
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.filters import (
-    Expectation,
-    KalmanFilter,
-    NodeFilter,
-    Outcomes,
-    joint_update,
-)
+from fusion_gym.systems.tobit import filters
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 
@@ -38,10 +32,10 @@ class CentrePrediction(NamedTuple):
     granted, ``None`` for all.
     """
 
-    expectation: Expectation
+    expectation: filters.Expectation
     deviation: Array
     root: Array
-    outcomes: Outcomes | None = None
+    outcomes: filters.Outcomes | None = None
     held: Any = None
     moment: Any = None
     possible: Any = None
@@ -162,13 +156,13 @@ class NodeCentre(Centre):
     Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (27).
     """
 
-    filter: NodeFilter
+    filter: filters.NodeFilter
     share: Array
 
     @property
     def predictable(self) -> bool:
         """See :class:`Centre`; true for Kalman filters of uncensored sensors."""
-        return type(self.filter) is KalmanFilter and self.sensors.unlimited
+        return type(self.filter) is filters.KalmanFilter and self.sensors.unlimited
 
 
 @dataclass(frozen=True)
@@ -249,7 +243,7 @@ class FederatedCentre(NodeCentre):
     (18)-(27).
     """
 
-    filter: KalmanFilter
+    filter: filters.KalmanFilter
     separable = True
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
@@ -262,7 +256,7 @@ class FederatedCentre(NodeCentre):
             # Both sides times √Z, so that weight 0 is no exception.
             scale = (weight[:, None] / (1.0 + weight[:, None] * sensors.variance)) ** 0.5
             nothing = 0.0 * expectation.value
-            _, silent = joint_update(_stack(scale[:, :, None] * observed), _stack(nothing))
+            _, silent = filters.joint_update(_stack(scale[:, :, None] * observed), _stack(nothing))
             root = linalg.matmul(root, linalg.root(silent))
         return CentrePrediction(expectation, deviation, root)
 
@@ -356,7 +350,7 @@ class SequentialCentre(Centre):
         return silent, silent - linalg.weighted_trace(expected, weights)
 
 
-def _deviation(sensors: CensoredSensors, expectation: Expectation, spread: Array) -> Array:
+def _deviation(sensors: CensoredSensors, expectation: filters.Expectation, spread: Array) -> Array:
     """Return the innovation's deviation from the variances ``spread`` of C x, all (l, m, N)."""
     q = expectation.uncensored_probability
     variance = q * q * spread + expectation.noise_variance + 1e-3 * sensors.variance
@@ -372,12 +366,12 @@ def _shifted(
     mean: Array, prediction: CentrePrediction, matrix: Array, value: Array
 ) -> tuple[Array, Array]:
     """Return mean and covariance of x = x̂ + G z after :func:`joint_update` of z."""
-    shift, covariance = joint_update(matrix, value)
+    shift, covariance = filters.joint_update(matrix, value)
     root = prediction.root
     return mean + linalg.matvec(root, shift), linalg.congruence(root, covariance)
 
 
-def _outcomes(prediction: CentrePrediction) -> Outcomes:
+def _outcomes(prediction: CentrePrediction) -> filters.Outcomes:
     if prediction.outcomes is None:
         raise RuntimeError("the prediction has no outcomes: another centre made it")
     return prediction.outcomes

@@ -17,6 +17,7 @@ from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 from fusion_gym.systems.silence import Trigger
+from fusion_gym.systems.tobit import options as tobit_options
 from fusion_gym.systems.tobit.centres import (
     HoldCentre,
     JointCentre,
@@ -24,14 +25,6 @@ from fusion_gym.systems.tobit.centres import (
     hold_centre,
     joint_centre,
     truncated_centre,
-)
-from fusion_gym.systems.tobit.options import (
-    FILTERS,
-    FeedbackOptions,
-    Filter,
-    at_the_nodes,
-    classes,
-    feedback_scenario,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
@@ -112,17 +105,18 @@ def _matrices(value: Any, states: int) -> list[Array]:
     return result
 
 
+def _each(name: str, value: Any, kind: str, sensors: int) -> list[tuple[str, Any]]:
+    """Return field and value of each sensor, from one number for all or one entry for each."""
+    if _dimensions(value) == 0:
+        return [(name, value)] * sensors
+    entries = validation.entries(name, value, kind, count=sensors)
+    return [(f"{name}[{place}]", entry) for place, entry in enumerate(entries)]
+
+
 def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
-    name, count = "measurement_covariances", len(sizes)
-    single = _dimensions(values) == 0
-    each = (
-        [values] * count
-        if single
-        else validation.entries(name, values, "a covariance or a variance", count=count)
-    )
+    each = _each("measurement_covariances", values, "a covariance or a variance", len(sizes))
     result = []
-    for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
-        full = name if single else f"{name}[{place}]"
+    for size, (full, value) in zip(sizes, each, strict=True):
         if _dimensions(value) == 0:
             value = validation.number(full, value, at_least=validation.SMALLEST**2) * np.eye(size)
         result.append(validation.covariance(full, value, size, definite=True))
@@ -131,15 +125,9 @@ def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
 
 def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
     """Return limits (sensors, m); absent channels have the limit ``none``."""
-    item = _dimensions(values) == 0
-    each = (
-        [values] * len(sizes)
-        if item
-        else validation.entries(name, values, "a number or a list", count=len(sizes))
-    )
+    each = _each(name, values, "a number or a list", len(sizes))
     result = np.full((len(sizes), max(sizes)), none)
-    for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
-        full = name if item else f"{name}[{place}]"
+    for place, (size, (full, value)) in enumerate(zip(sizes, each, strict=True)):
         result[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
     return result
 
@@ -155,17 +143,19 @@ def _dimensions(value: Any) -> int:
 
 
 _FILTERS = {
-    "kalman": FILTERS["kalman"],
-    "tobit": at_the_nodes(TobitKalmanFilter),
-    "adf": FILTERS["adf"],
-    "stochastic": FILTERS["stochastic"],
-    "joint": Filter(JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False),
-    "hold": Filter(
+    "kalman": tobit_options.FILTERS["kalman"],
+    "tobit": tobit_options.at_the_nodes(TobitKalmanFilter),
+    "adf": tobit_options.FILTERS["adf"],
+    "stochastic": tobit_options.FILTERS["stochastic"],
+    "joint": tobit_options.Filter(
+        JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False
+    ),
+    "hold": tobit_options.Filter(
         HoldCentre,
         lambda options, sensors: hold_centre(sensors, _system(options)[0]),
         nodes=False,
     ),
-    "truncated": Filter(
+    "truncated": tobit_options.Filter(
         TruncatedCentre, truncated_centre, own=("trigger", "trigger_threshold"), nodes=False
     ),
 }
@@ -174,7 +164,7 @@ _FILTERS = {
 
 
 @dataclass(frozen=True)
-class LinearFusionOptions(FeedbackOptions):
+class LinearFusionOptions(tobit_options.FeedbackOptions):
     """Any linear plant x' = A x + w and any sensors y = C x + v, each of its own size.
 
     Every sensor has a Kalman filter; the centre fuses them and feeds the result back. If a sensor
@@ -209,7 +199,7 @@ class LinearFusionOptions(FeedbackOptions):
         (1, ('x1',))
     """
 
-    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
     """A of x(t+1) = A x(t) + w(t), (n, n)."""
     process_covariance: ArrayLike = ((_STEP**3 / 3.0, _STEP**2 / 2.0), (_STEP**2 / 2.0, _STEP))
@@ -280,7 +270,7 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     if correlated:
         _check_rules(choice)
     holds = choice.filter == "hold"
-    scenario = feedback_scenario(
+    scenario = tobit_options.feedback_scenario(
         choice,
         _FILTERS,
         plant,

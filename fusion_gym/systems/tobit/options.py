@@ -14,13 +14,7 @@ from fusion_gym.core.options import PaperOptions, Scenario, plain_options
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.systems.tobit.centre import (
-    Centre,
-    FederatedCentre,
-    FeedbackCentre,
-    SequentialCentre,
-    information_shares,
-)
+from fusion_gym.systems.tobit import centre as fusion_centre
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
@@ -62,7 +56,7 @@ class Filter:
     """
 
     kind: type
-    make: Callable[[Any, CensoredSensors], Centre]
+    make: Callable[[Any, CensoredSensors], fusion_centre.Centre]
     own: tuple[str, ...] = ()
     nodes: bool = True
 
@@ -159,7 +153,7 @@ def feedback_scenario(
     )
 
 
-def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
+def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> fusion_centre.Centre:
     """Return nodes with this filter and the options' fusion.
 
     Args:
@@ -174,12 +168,12 @@ def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
     weights = options.own_weights(node.sensors.measurement_matrix.shape[2])
     fusion = choose_rule(kind, _STRUCTURE, sensors, options.order, weights)
     if kind == "federated":
-        share = information_shares(options.information_shares, sensors)
+        share = fusion_centre.information_shares(options.information_shares, sensors)
         if isinstance(node, KalmanFilter):
-            return FederatedCentre(node, share)
-        return FeedbackCentre(node, share, fusion)
+            return fusion_centre.FederatedCentre(node, share)
+        return fusion_centre.FeedbackCentre(node, share, fusion)
     _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
-    return FeedbackCentre(node, np.ones((sensors, 1)), fusion)
+    return fusion_centre.FeedbackCentre(node, np.ones((sensors, 1)), fusion)
 
 
 # What every environment of the family offers; each adds its paper's own.
@@ -187,7 +181,7 @@ FILTERS = {
     "kalman": at_the_nodes(KalmanFilter),
     "adf": Filter(
         AssumedDensityFilter,
-        lambda _, sensors: SequentialCentre(AssumedDensityFilter(sensors)),
+        lambda _, sensors: fusion_centre.SequentialCentre(AssumedDensityFilter(sensors)),
         nodes=False,
     ),
     "stochastic": Filter(

@@ -19,19 +19,10 @@ from fusion_gym import validation
 from fusion_gym.core.options import Scenario, SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states, trigger_parameters
+from fusion_gym.systems.tobit import options as tobit_options
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
-from fusion_gym.systems.tobit.options import (
-    FILTERS,
-    FeedbackOptions,
-    Filter,
-    at_the_nodes,
-    classes,
-    feedback_centre,
-    feedback_scenario,
-)
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
-from fusion_gym.validation import ConfigurationError
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
@@ -40,17 +31,19 @@ _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
 _HELD = "the silent filter continues from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
-    "paper": Filter(
+    "paper": tobit_options.Filter(
         BoundTobitFilter,
-        lambda options, sensors: feedback_centre(options, _bound_filter(options, sensors)),
+        lambda options, sensors: tobit_options.feedback_centre(
+            options, _bound_filter(options, sensors)
+        ),
     ),
-    "tobit": at_the_nodes(TobitKalmanFilter),
-    **FILTERS,
+    "tobit": tobit_options.at_the_nodes(TobitKalmanFilter),
+    **tobit_options.FILTERS,
 }
 
 
 @dataclass(frozen=True)
-class TobitOscillatorOptions(FeedbackOptions):
+class TobitOscillatorOptions(tobit_options.FeedbackOptions):
     """An oscillator measured by three sensors that are censored below a threshold.
 
     The plant is a rotation by 0.052 π a step, driven by noise. Three sensors measure both states
@@ -76,7 +69,7 @@ class TobitOscillatorOptions(FeedbackOptions):
         (3, ('x1', 'x2'))
     """
 
-    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)
     transition: ArrayLike = ((_COS, _SIN), (-_SIN, _COS))
     """A of equation (1), (n, n). By default a rotation by 0.052 π."""
     process_noise: Literal["scalar", "full"] = "scalar"
@@ -139,7 +132,7 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
     trigger = _trigger(options, sensors.count)
     for name, refused in (("silent", "hold"), ("event_error", True)):
         if options.filter != "paper" and getattr(options, name) == refused:
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"{name} = {refused!r} is not allowed with filter={options.filter!r}: it belongs "
                 "to filter='paper' (the others predict in silence, without an event error)"
             )
@@ -148,7 +141,7 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
         # The paper's minimises a bound; with every measurement it errs thrice.
         memory_filter = "adf"
     holds = options.filter == "paper" and options.silent != "predict"
-    return feedback_scenario(
+    return tobit_options.feedback_scenario(
         options,
         _FILTERS,
         plant,
@@ -198,7 +191,7 @@ def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> Non
         names = ("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial")
         args = {name: getattr(options, name) for name in (*names, "bound_young", "horizon")}
         listed = ", ".join(f"{name} = {validation.display(value)}" for name, value in args.items())
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"{listed} are not allowed together: the bound of the event error must stay below "
             f"{_LARGEST_EVENT_ERROR:g}; use a smaller decay, a larger divisor or event_error=False"
         )

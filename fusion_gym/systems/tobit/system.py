@@ -21,17 +21,8 @@ from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import Block, Signal, age_block, common_signals, numbered, sensed
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.namespace import namespace
+from fusion_gym.systems import parts
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
-from fusion_gym.systems.parts import (
-    RANGE,
-    AdoptingEstimator,
-    Deliveries,
-    NormalPlant,
-    SensorPlant,
-    Truth,
-    prior_block,
-    variance_block,
-)
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
@@ -39,7 +30,7 @@ _TINY = float(np.finfo(float).tiny)  # stands for a variance of zero
 
 
 @dataclass(frozen=True)
-class CensoredPlant(SensorPlant[Truth], NormalPlant):
+class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
     """A linear plant and censored sensors.
 
     ``random_start`` draws the direction of the initial mean uniformly and announces it. For the
@@ -79,7 +70,7 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
                 result[state] = (min(before[0], ends[0]), max(before[1], ends[1]))
         return result
 
-    def start(self, noise: Array) -> tuple[Truth, Any]:
+    def start(self, noise: Array) -> tuple[parts.Truth, Any]:
         """Draw the initial state, and announce its mean (n, N)."""
         n = self.dynamics.size
         noise, departure = self.nature.begin(noise)
@@ -92,9 +83,9 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
         own = true_noise(departure, noise[:0], noise[2 * n :])[1]
         time = xp.zeros(runs)
         measurement = self.sensors.at(time).measure(truth, own, departure)
-        return Truth(truth, measurement, departure, time), mean
+        return parts.Truth(truth, measurement, departure, time), mean
 
-    def sense(self, state: Truth, noise: Array) -> Truth:
+    def sense(self, state: parts.Truth, noise: Array) -> parts.Truth:
         """Move the plant, and measure.
 
         Source: tobit_token_bucket, equations (1) and (2).
@@ -103,7 +94,7 @@ class CensoredPlant(SensorPlant[Truth], NormalPlant):
         process, own = true_noise(departure, noise[:r], noise[r:])
         truth = self.dynamics.at(state.time).advance(state.truth, process, departure)
         measurement = self.sensors.at(time).measure(truth, own, departure)
-        return Truth(truth, measurement, departure, time)
+        return parts.Truth(truth, measurement, departure, time)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`Plant`."""
@@ -152,7 +143,7 @@ class DailyLevel:
 
 
 @dataclass(slots=True)
-class CensoredEstimate(Deliveries):
+class CensoredEstimate(parts.Deliveries):
     """The estimate of N runs at one time; n states.
 
     ``time`` (N,), the step in the episode · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N),
@@ -182,7 +173,7 @@ _SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a re
 
 
 @dataclass(frozen=True)
-class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
+class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
     """A centre with or without nodes.
 
     ``model`` is the plant that the filters assume. ``scale`` (n,) divides observed state estimates
@@ -266,7 +257,7 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
         sensors = self.centre.sensors
         nodes = numbered(sensors.count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
-        new = partial(own, knowledge="own", limit=RANGE)
+        new = partial(own, knowledge="own", limit=parts.RANGE)
         at_threshold = "whether the component is at its threshold"
         uncensored = "predicted probability that the component is not censored"
         divisor, unit = 2.0 * sensors.deviation, "two noise deviations"
@@ -288,8 +279,8 @@ class CensoredEstimator(AdoptingEstimator[CensoredEstimate]):
                 lambda s: sensed(s.prediction).expectation.uncensored_probability,
             ),
             age_block(nodes),
-            variance_block(self._log_variance, self.state_names, self.reference),
-            prior_block(self.state_names, self.scale),
+            parts.variance_block(self._log_variance, self.state_names, self.reference),
+            parts.prior_block(self.state_names, self.scale),
         ]
         if sensors.unlimited:  # these two would say nothing
             blocks = [block for block in blocks if block.name not in _OF_CENSORING]

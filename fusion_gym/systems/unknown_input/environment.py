@@ -27,7 +27,6 @@ from fusion_gym.systems.unknown_input import filters, signals
 from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
 from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
-from fusion_gym.validation import ConfigurationError
 
 
 def two_carts(step: float = 0.25) -> tuple[Array, Array, Array]:
@@ -349,7 +348,7 @@ def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizo
     if kind == "predict":
         exact = filters.ExactInputStateFilter(model, joint)
         for sensor in np.flatnonzero(~(exact.growth(horizon) <= LARGEST_ERROR)):
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"horizon = {horizon} is not allowed with filter='predict' and sensor {sensor}: "
                 f"the input hides a direction whose variance grows by more than {LARGEST_ERROR:g}; "
                 "use a smaller horizon, another sensor, or filter='random_walk'"

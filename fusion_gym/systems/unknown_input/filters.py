@@ -20,7 +20,6 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.namespace import namespace, update_at
 from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
-from fusion_gym.validation import ConfigurationError
 
 _ALL = slice(None)
 _SETTLED = 1000  # steps after which gains count as settled
@@ -379,7 +378,7 @@ class BoundTables:
         noise = plain + (1.0 + 1.0 / epsilon) * square
         radius = _radius(joint, model, epsilon[:, 0, 0, 0], noise)
         for sensor in np.flatnonzero(~(radius < 1.0)):
-            raise ConfigurationError(
+            raise validation.ConfigurationError(
                 f"young_factor = {validation.display(young_factor)} is not allowed for sensor "
                 f"{sensor}: the spectral radius of sqrt(1 + young_factor) (I - N C) A must be "
                 f"below 1, not {radius[sensor]:.4g}; use a smaller factor, another sensor, or "

@@ -17,7 +17,6 @@ from fusion_gym.core.nature import true_motion
 from fusion_gym.namespace import ndtr
 from fusion_gym.systems.linear_plant import LinearDynamics, Sensors, covariance_factor, initial_law
 from fusion_gym.systems.unknown_input.signals import InputSignal
-from fusion_gym.validation import ConfigurationError
 
 _LONGEST_PERIOD = 1000  # small steps between two instants
 _RANK = 1e-8  # singular values below this share of what they could be count as zero
@@ -221,17 +220,10 @@ class InputSensors(Sensors):
 
 def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
     """Return V as (l, m, m)."""
-    try:
-        values = np.asarray(value)
-    except ValueError:
-        values = np.empty(0)
-    if values.shape == (sensors, size, size):
-        return np.array(
-            [
-                validation.covariance(f"measurement_covariance[{i}]", value, size, definite=True)
-                for i, value in enumerate(values)
-            ]
-        )
+    if validation.array_shape(value) == (sensors, size, size):
+        names = (f"measurement_covariance[{sensor}]" for sensor in range(sensors))
+        pairs = zip(names, np.asarray(value), strict=True)
+        return np.array([validation.covariance(*pair, size, definite=True) for pair in pairs])
     value = validation.by_row(value, (sensors, size))
     variances = validation.positive("measurement_covariance", value, (sensors, size))
     return variances[..., None] * np.eye(size)
@@ -245,7 +237,7 @@ def _observable_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> t
     possible = np.linalg.norm(matrix, 2) * np.linalg.norm(inputs, 2)
     rank = int(np.sum(values > _RANK * possible))
     if rank < q:
-        raise ConfigurationError(
+        raise validation.ConfigurationError(
             f"measurement_matrices[{sensor}] = {validation.display(matrix)} is not allowed: the "
             f"sensor must measure every input, but rank(C B) is {rank} for {q} "
             f"input{'s' if q > 1 else ''} (B is the input matrix over one sampling interval)"

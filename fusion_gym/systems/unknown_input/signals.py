@@ -137,14 +137,8 @@ class Sinusoids(InputSignal):
 
 def _terms(*values: ArrayLike) -> int:
     """Return the number of sinusoids, the longest last axis."""
-    lengths = []
-    for value in values:
-        try:
-            array = np.asarray(value)
-        except ValueError:
-            continue
-        lengths.append(array.shape[-1] if array.ndim else 1)
-    return max(lengths, default=1)
+    shapes = (validation.array_shape(value) for value in values)
+    return max((shape[-1] if shape else 1 for shape in shapes if shape is not None), default=1)
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,8 @@ import numpy as np
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    LOCAL_VARIANCE,
-    Block,
-    age_block,
-    common_signals,
-    log_deviation,
-    numbered,
-    sensed,
-)
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.namespace import namespace, ndtr
 from fusion_gym.systems.linear_plant import largest_ratio
@@ -169,8 +161,8 @@ class UnknownInputEstimate(Deliveries):
 
 
 SIGNALS = (
-    LOCAL_VARIANCE,
-    *common_signals(
+    knowledge.LOCAL_VARIANCE,
+    *knowledge.common_signals(
         age="sampling instants since the last delivery",
         expected_measurement="the node's expectation, with the predicted input",
         prior_mean="prediction of the fused state",
@@ -201,11 +193,11 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
         return 1 if follows else None
 
     @property
-    def observation(self) -> tuple[Block, ...]:
+    def observation(self) -> tuple[knowledge.Block, ...]:
         """Blocks of the observation; a "state" is a state or an input."""
-        nodes = numbered(self.nodes.sensors.count)
-        labels = (nodes, numbered(self.nodes.sensors.size))
-        new = partial(Block, labels=labels, knowledge="own", node="own", limit=RANGE)
+        nodes = knowledge.numbered(self.nodes.sensors.count)
+        labels = (nodes, knowledge.numbered(self.nodes.sensors.size))
+        new = partial(knowledge.Block, labels=labels, knowledge="own", node="own", limit=RANGE)
         innovation = "innovation of the node over its predicted deviation"
         return (
             new("whitened_innovation", innovation, self._whitened),
@@ -215,7 +207,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
                 lambda s: (s.measurement - s.held) / self._noise_deviation,
                 constants={"√2 noise deviations": self._noise_deviation[..., 0]},
             ),
-            age_block(nodes),
+            knowledge.age_block(nodes),
             self.deviation_block(
                 "local_log_deviation",
                 "logarithm of the node's predicted over the open-loop deviation",
@@ -229,7 +221,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
             ),
             self.estimate_block(
                 "fused prediction over the root mean square",
-                lambda s: sensed(s.prediction).fused_mean,
+                lambda s: knowledge.sensed(s.prediction).fused_mean,
             ),
         )
 
@@ -255,14 +247,14 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
 
         Source: unknown_input, equations (8), (24), (25).
         """
-        prediction, arrived = sensed(state.prediction), reception.arrived
+        prediction, arrived = knowledge.sensed(state.prediction), reception.arrived
         after = state.after(arrived)
         estimates = self.nodes.update(state.estimates, prediction, after.held, arrived, state.time)
         return replace(after, estimates=estimates)
 
     def read(self, state: UnknownInputEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
-        prediction = sensed(state.prediction)
+        prediction = knowledge.sensed(state.prediction)
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
@@ -296,7 +288,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
     def _deviation(self, state: UnknownInputEstimate) -> Array:
         """Return the innovation's deviation (l, m, N or 1)."""
         n, sensors = self.nodes.model.size, self.nodes.sensors
-        prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
+        prior = self.nodes.prior_covariance(knowledge.sensed(state.prediction), state.time)
         spread = linalg.matmul(sensors.measurement_matrix, prior[:, :n, :n])
         variance = spread[..., 0, :] * sensors.measurement_matrix[..., 0, :]
         for column in range(1, n):
@@ -310,19 +302,20 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
         return np.sqrt(2.0 * linalg.diagonal(self.nodes.sensors.covariance))
 
     def _whitened(self, state: UnknownInputEstimate) -> Array:
-        return (state.measurement - sensed(state.prediction).expected) / self._deviation(state)
+        expected = knowledge.sensed(state.prediction).expected
+        return (state.measurement - expected) / self._deviation(state)
 
     def _local_log_deviation(self, state: UnknownInputEstimate) -> Array:
-        prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
-        return _lanes(log_deviation(prior, self.reference), len(state.time))
+        prior = self.nodes.prior_covariance(knowledge.sensed(state.prediction), state.time)
+        return _lanes(knowledge.log_deviation(prior, self.reference), len(state.time))
 
     def _log_deviation(self, state: UnknownInputEstimate) -> Array:
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
-        return _lanes(log_deviation(before, self.reference), len(state.time))
+        return _lanes(knowledge.log_deviation(before, self.reference), len(state.time))
 
     def _local_variance(self, state: UnknownInputEstimate) -> Array:
         n = self.nodes.model.size
-        prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
+        prior = self.nodes.prior_covariance(knowledge.sensed(state.prediction), state.time)
         return _lanes(linalg.trace(prior[:, :n, :n]), len(state.time))
 
     def _fused_prior(self, state: UnknownInputEstimate) -> Array:
