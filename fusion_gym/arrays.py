@@ -1,6 +1,7 @@
 """Arrays of N runs with the batch axis last, and records of such arrays."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -8,6 +9,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+class Lazy:
+    """A value that is computed on first access."""
+
+    def __init__(self, compute: Callable[[], Any]) -> None:
+        self._compute = compute
+
+    @functools.cached_property
+    def value(self) -> Any:
+        """The value."""
+        return self._compute()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"value": self.value}
+
+
+def value_of(value: Any) -> Any:
+    """Return the value of a :class:`Lazy`, and any other value as it is."""
+    return value.value if isinstance(value, Lazy) else value
 
 
 def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:

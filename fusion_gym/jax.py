@@ -88,6 +88,9 @@ class FunctionalEnv:
         self.__setstate__({})
         estimator = task.estimator
         self._memory, self._layout = Memory(task, "scheduler"), ObservationLayout(task)
+        for name in ("memory", "belief_features"):
+            if value := getattr(task, name):
+                raise refusal(name, value, "the default", "in pure functions")
         self._view = SchedulerView(task)
         self._starts = task.plant.start_channels + task.network.start_channels
         self._channels = task.plant.noise_channels + task.network.noise_channels

@@ -50,8 +50,11 @@ COMPARISONS: dict[str, tuple[str, str, Any]] = {
     "ge": ("oge", "ge", np.greater_equal),
 }
 # Functions of real numbers, of LLVM or of the C library.
-_SAME = ("exp", "exp2", "log", "log1p", "expm1", "sin", "cos", "tan", "sinh", "cosh", "tanh")
-FUNCTIONS = {name: name for name in (*_SAME, "asin", "acos", "atan", "atan2", "erf", "erfc", "pow")}
+_SAME = (
+    *("exp", "exp2", "log", "log1p", "expm1", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
+    *("asin", "asinh", "acos", "atan", "atan2", "erf", "erfc", "pow"),
+)
+FUNCTIONS = {name: name for name in _SAME}
 FUNCTIONS |= {name: f"llvm.{name}" for name in ("sqrt", "floor", "ceil")}
 # Other functions of numbers: of the program, the type, the parameters and the numbers.
 NUMBERS: dict[str, Callable[..., Any]] = {
@@ -77,6 +80,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     "split": lambda params, x: np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"]),
     "slice": lambda params, x: _sliced(x, **params),
     "broadcast_in_dim": lambda params, x: _broadcast(x, **params),
+    "tile": lambda params, x: np.tile(x, params["reps"]),
     "iota": lambda params: _counted(**params),
     "pad": lambda params, x, value: _padded(x, value, params["padding_config"]),
 }

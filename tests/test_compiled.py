@@ -1,6 +1,7 @@
 """Programs of JAX in machine code, and the cache of their code."""
 
 import ctypes
+import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,6 +22,7 @@ import fusion_gym.jax
 from fusion_gym.core import compiled
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_priced, run_several
 from fusion_gym.lowering import Buffer, LoweringError, assembly
 
 LINEAR, REMOTE = "fusion_gym/LinearFusion-v2", "fusion_gym/RemoteEstimation-v1"
@@ -189,7 +191,7 @@ def test_other_numbers_have_other_code(cache: Path) -> None:
 @pytest.mark.parametrize(
     ("env_id", "options", "reason"),
     [
-        ("TobitOscillator-v1", {"memory": True}, "memory = True is not allowed under JAX"),
+        ("LinearFusion-v2", {"true_transition": 0.9}, "true_transition = 0.9 is not allowed"),
         ("LinearFusion-v2", {"delay": 1}, "delay = 1 is not allowed under JAX"),
         ("LinearFusion-v2", {"filter": "hold"}, "filter = 'hold' is not allowed under JAX"),
     ],
@@ -205,9 +207,12 @@ def test_numpy_runs_what_is_not_lowered(env_id: str, options: dict[str, Any], re
     assert env.step(action)[1] == plain.step(action)[1]
 
 
-def test_resets_of_some_runs_and_restored_runs_are_those_of_numpy() -> None:
+@pytest.mark.parametrize(
+    "options", [{}, {"memory": True, "cost_weight": "random", "price_range": (0.1, 1.0)}], ids=str
+)
+def test_resets_of_some_runs_and_restored_runs_are_those_of_numpy(options: dict[str, Any]) -> None:
     batches = [
-        EpisodeBatch.seeded(fusion_gym.make_task(LINEAR, backend=backend), 4, 0)
+        EpisodeBatch.seeded(fusion_gym.make_task(LINEAR, backend=backend, **options), 4, 0, "own")
         for backend in ("numpy", "compiled")
     ]
     rng, stored = np.random.default_rng(0), [{}, {}]
@@ -228,3 +233,57 @@ def test_resets_of_some_runs_and_restored_runs_are_those_of_numpy() -> None:
         batches[1].observe()[:] = np.nan  # the caller's own
         state = [batch.delivered.estimate.mean for batch in batches]
         np.testing.assert_allclose(*state, rtol=1e-12)
+        np.testing.assert_allclose(*(batch.beliefs().value for batch in batches), atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(2,), (1, 4), (2, 1), (2, 3), (3, 4)])
+def test_requests_have_a_row_for_each_sensor_and_a_column_for_each_run(shape: Any) -> None:
+    batch = EpisodeBatch.seeded(fusion_gym.make_task(LINEAR, backend="compiled"), 4, 0)
+    if 1 in shape:
+        assert batch.step(np.ones(shape, np.bool_)).requested.all()
+    else:
+        with pytest.raises(ValueError, match="broadcast"):
+            batch.step(np.ones(shape, np.bool_))
+
+
+RULES = (
+    *("innovation_threshold:threshold=1,at_most=1", "stochastic_event", "periodic:period=3"),
+    *("value_of_information:threshold=.05", "estimate_difference:threshold=.5,at_most=1"),
+    *("kullback_leibler:threshold=.5", "priced_threshold:margin=1.2,mixture=.3,age_exponent=.2"),
+    *("value_of_information:own=true,threshold=.05", "priced_threshold:own=true"),
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("TobitOscillator-v1", {"memory": True, "filter": "tobit", "token_rate": 2.0}),
+        ("TobitOscillator-v1", {"memory": True, "broadcast": "estimate", "horizon": 40}),
+        ("BiasedOscillator-v1", {"memory": True, "access": "any"}),
+        ("LinearFusion-v2", {}),
+        ("RemoteEstimation-v1", {"memory": True, "sensors": 2, "channel": "independent"}),
+        pytest.param(
+            "CorrelatedTracking-v1", {"memory": True, "horizon": 30}, marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_figures_of_policies_are_those_of_numpy(name: str, options: dict[str, Any]) -> None:
+    tasks = [
+        fusion_gym.make_task(f"fusion_gym/{name}", backend=backend, **options)
+        for backend in ("numpy", "compiled")
+    ]
+    own = tasks[0].network.rule.by_channel or name.startswith(("Linear", "Correlated"))
+    rules = RULES[: -2 if own else None]
+    every = [
+        run_several(task, [fusion_gym.make_policy(rule, task) for rule in rules], 20, 0)
+        for task in tasks
+    ]
+    prices = np.geomspace(0.01, 1.0, 20)
+    for results, task in zip(every, tasks, strict=True):
+        policy = fusion_gym.make_policy("priced_threshold", task)
+        results.append(run_priced(task, policy, np.arange(20), prices))
+    assert sum(0.05 < result.rate.mean() < 0.95 for result in every[0]) > 4
+    for numpy, ours in zip(*every, strict=True):
+        for field in dataclasses.fields(numpy):
+            pair = (getattr(part, field.name) for part in (ours, numpy))
+            np.testing.assert_allclose(*pair, rtol=1e-9, atol=1e-12, err_msg=field.name)

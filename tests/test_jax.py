@@ -81,7 +81,13 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
     [
         *(("jax", *task) for task in TASKS),
         *slowly(("jax", *task) for task in SLOW_TASKS),
+        *slowly([("jax", "TobitOscillator-v1", {"memory": True})]),
         *(("compiled", *task) for task in (*TASKS, *SLOW_TASKS)),
+        (
+            "compiled",
+            "LinearFusion-v2",
+            {"memory": True, "cost_weight": "random", "price_range": (0.1, 1.0)},
+        ),
     ],
 )
 def test_backend_equals_numpy_and_itself_in_any_batch(
@@ -222,6 +228,7 @@ def test_parameters_may_be_mapped() -> None:
     ("name", "options", "field"),
     [
         ("TobitOscillator-v1", {"memory": True}, "memory"),
+        ("TobitOscillator-v1", {"belief_features": ["value"]}, "belief_features"),
         ("LinearFusion-v2", {"filter": "hold"}, "filter"),
         ("LinearFusion-v2", {"true_process_noise": 2.0}, "true_process_noise"),
         ("LinearFusion-v2", {"error": "numpy:trace"}, "error"),
@@ -231,6 +238,8 @@ def test_what_jax_does_not_run_is_refused(name: str, options: dict[str, Any], fi
     options = {"error": lambda error, _: (error**2).sum(0)} if field == "error" else options
     with pytest.raises(ConfigurationError, match=rf"^{field} = .* is not allowed"):
         fusion_gym.jax.make(f"fusion_gym/{name}", **options)
+    if field in ("memory", "belief_features"):
+        return
     with pytest.raises(ConfigurationError, match=rf"^{field} = .* is not allowed under JAX"):
         gymnasium.make(f"fusion_gym/{name}", backend="jax", **options)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import validation
-from fusion_gym.arrays import Array, merge_runs
+from fusion_gym.arrays import Array, Lazy, merge_runs
 from fusion_gym.core.access import check_requests
 from fusion_gym.core.admission import require_finite
 from fusion_gym.core.beliefs import Owner
@@ -18,18 +18,12 @@ from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import (
-    Lazy,
-    Outcome,
-    Runs,
-    advance,
-    start_of,
-)
+from fusion_gym.core.runs import Outcome, Runs, advance, start_of
 from fusion_gym.core.task import Task
-from fusion_gym.errors import refusal
 
 # Normals in a block, of one run and of all runs (64 MB); a block has at least one step.
 _BLOCK_OF_RUN, _BLOCK = 2**11, 2**23
+_ONE = np.array(1)  # which NumPy adds to an array in half the time of a Python number
 _TOGETHER = 256  # runs per transposition, which then stays in the cache
 
 
@@ -75,10 +69,9 @@ class EpisodeBatch(Runs):
         )
         self._full_state: Any = None  # the reference's state after observing
         self._program = self._make_program()
-        # State, position and observations (entries, N) after the program's last step.
+        # State and rows after the program's last step.
         self._computed: Lazy | None = None
         self._rows: Any = None
-        self._observed: NDArray[np.float32] | None = None
         self.price = task.reward.price.draw(np.zeros(num_envs))
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.finished = np.ones(num_envs, dtype=np.bool_)
@@ -86,6 +79,15 @@ class EpisodeBatch(Runs):
         most = min(_BLOCK_OF_RUN, _BLOCK // num_envs) // max(1, self.channels)
         self._block = np.zeros((min(task.horizon + 1, max(1, most)), self.channels, num_envs))
         self._row = 0  # row of the block with the last sensing's noise
+
+    @property
+    def price(self) -> Array:
+        """Price of a token (N,)."""
+        return self._price
+
+    @price.setter
+    def price(self, price: Array) -> None:
+        self._price, self._computed = price, None
 
     @classmethod
     def seeded(
@@ -133,7 +135,7 @@ class EpisodeBatch(Runs):
         keys = self._keys(runs)
         if task.reward.price.fixed is None:
             drawn = np.array([self.source.uniform(*key) for key in keys])
-            self.price = merge_runs(self.price, task.reward.price.draw(drawn), runs)
+            self._price = merge_runs(self.price, task.reward.price.draw(drawn), runs)
         if everyone:
             self._row = 0
         self._draw(runs)
@@ -160,7 +162,7 @@ class EpisodeBatch(Runs):
             state = state._replace(history=(last,) * (len(task.network.delay) - 1))
         self.state = state if everyone else merge_runs(self.state, state, runs)
 
-    def step(self, requests: NDArray[Any]) -> Outcome:
+    def step(self, requests: NDArray[Any], run: int | None = None) -> Outcome:
         """Grant requests, update, fuse and reward; then move the plant and sense.
 
         Finished runs continue without meaning until they are reset.
@@ -168,6 +170,7 @@ class EpisodeBatch(Runs):
         Args:
             requests: (sensors, N) bool, or with ``access="assignment"`` the channel from 1 of each
                 packet, 0 for none; a channel that two ask for goes to the first in the queue.
+            run: Run of the outcome, which then has no batch axis; ``None`` returns all.
 
         Raises:
             RuntimeError: The batch was never reset.
@@ -175,8 +178,12 @@ class EpisodeBatch(Runs):
         """
         if self._state is None:
             raise RuntimeError("call reset before the first step")
-        outcome = self.deliver(requests) if self._program is None else self._run_program(requests)
-        if np.count_nonzero(outcome.diverged) and not np.isfinite(outcome.error).all():
+        if self._program is not None:
+            outcome = self._run_program(requests, run)
+        else:
+            outcome = self.deliver(requests) if run is None else self.deliver(requests).single(run)
+        diverged = np.count_nonzero(outcome.diverged) if run is None else outcome.diverged
+        if diverged and not np.isfinite(outcome.error).all():
             estimate = self.delivered.estimate
             covariance = self.task.estimator.covariance(estimate)
             mean = self.task.estimator.mean(estimate)
@@ -191,13 +198,13 @@ class EpisodeBatch(Runs):
             predicted = self.reference.predict(self._full_state)
             measurement = self.task.plant.measurement(self.state.plant)
             self._full_state = self.reference.observe(predicted, measurement)
-        self.finished = outcome.ended.copy()
+        self.finished = np.array(outcome.ended, ndmin=1)
         return outcome
 
     def observe(self, local: bool = False) -> NDArray[np.float32]:
         """Return observations (N, entries); NaN in an unfinished run is a ``DivergenceError``."""
-        if self._state is self._computed and self._observed is not None:
-            observation = self._observed.T.copy()
+        if self._state is self._computed and self._rows is not None:
+            observation: NDArray[np.float32] = self._program.observation(self._rows)
         else:
             observation = super().observe(local)
         if not math.isfinite(np.vdot(observation, observation)):
@@ -233,22 +240,20 @@ class EpisodeBatch(Runs):
             return None
         from fusion_gym.core.jitted import JittedStep
 
-        if self.memory.parts:
-            raise refusal("backend", "jax", "'numpy' with memory or the beliefs of local sensors")
         return JittedStep(*parts)
 
-    def _run_program(self, requests: NDArray[Any]) -> Outcome:
+    def _run_program(self, requests: NDArray[Any], run: int | None) -> Outcome:
         """Make both halves of a step by the backend's program."""
-        rule, slots = self.task.network.rule, self.task.network.slots
-        check_requests(requests, slots * rule.by_channel)
+        if requests.dtype != np.bool_:
+            network = self.task.network
+            check_requests(requests, network.slots * network.rule.by_channel)
         rows, program = self._packed(), self._program
-        self.steps = self.steps + 1
+        self.steps = self.steps + _ONE
         self._move()
         rows = program(rows, requests, self.normals())
-        outcome, observed = program.result(rows)
-        self._set_rows(rows, observed)
+        self._set_rows(rows)
         self._delivered = Lazy(lambda: program.delivered(rows))
-        self.memory.forget()
+        outcome: Outcome = program.outcome(rows, run)
         return outcome
 
     def _begin(self, start: Array, noise: Array, runs: NDArray[np.int64] | None) -> None:
@@ -258,19 +263,23 @@ class EpisodeBatch(Runs):
         if runs is not None:
             begun, rows = rows, self._packed().copy()
             rows[runs] = begun
-        self._set_rows(rows, self._program.observation(rows))
-        self.memory.forget()
+        self._set_rows(rows)
 
     def _packed(self) -> Any:
         """Return the program's rows of the present state."""
         if self._state is not self._computed:
-            self._rows = self._program.pack(self.position())
+            memory = self.memory.whole(self.num_envs)
+            self._rows = self._program.pack(self.position(), memory)
         return self._rows
 
-    def _set_rows(self, rows: Any, observed: NDArray[np.float32]) -> None:
-        """Set the program's rows and observations (entries, N) as the present state."""
-        self._rows, self._observed, program = rows, observed, self._program
-        self._computed = self._state = Lazy(lambda: program.position(rows).state)
+    def _set_rows(self, rows: Any) -> None:
+        """Set the program's rows as the present state."""
+        self._rows, program = rows, self._program
+        moved = Lazy(lambda: program.moved(rows))
+        self._computed = self._state = Lazy(lambda: moved.value[0].state)
+        if self.memory.parts:
+            self.memory = self.memory.with_states(Lazy(lambda: moved.value[1]))
+        self.memory.forget()
 
     def _move(self) -> None:
         """Move to the noise of the next sensing."""
@@ -313,6 +322,17 @@ class EpisodeBatch(Runs):
             beside = some[-1] - some[0] == len(some) - 1
             places = slice(some[0], some[-1] + 1) if beside else some
             lanes[:, places] = drawn.reshape(len(some), -1).T
+
+
+def draw_episodes(task: Task, seeds: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return the normals (channels, N) of starts and (steps + 1, channels, N) of steps."""
+    keys, count, starts, steps = [(seed, 0) for seed in seeds.tolist()], task.horizon + 1, [], []
+    parts: tuple[Any, ...] = task.plant, task.network
+    for stream, part in enumerate(parts):
+        source, channels = PhiloxNoise(stream), part.noise_channels
+        starts.append(_starts(source, keys, part.start_channels))
+        steps.append(np.stack([source.steps(*key, 0, count, channels) for key in keys], axis=-1))
+    return np.concatenate(starts), np.concatenate(steps, axis=1)
 
 
 def _starts(source: NoiseSource, keys: list[tuple[int, int]], channels: int) -> Array:

@@ -20,17 +20,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.arrays import Array, merge_runs, take_runs
+from fusion_gym.arrays import Array, map_arrays, take_runs
 from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.task import ONE_STEP, Task
 from fusion_gym.fusion.intersection import covariance_intersection
+from fusion_gym.namespace import namespace
 
 Owner = Literal["scheduler", "own"]
 Packets = NDArray[np.bool_]
@@ -98,6 +99,19 @@ class MemoryColumns(NamedTuple):
                 width = state.measurement.shape[-1] // part.copies
                 result[name] = take_runs(state, part.places(columns, width))
         return result
+
+
+class DerivedBeliefs:
+    """Beliefs whose attributes are a function of their names, each computed on first access."""
+
+    def __init__(self, attribute: Callable[[str], Any]) -> None:
+        self._attribute = attribute
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        vars(self)[name] = value = self._attribute(name)
+        return value
 
 
 @dataclass(frozen=True)
@@ -183,7 +197,9 @@ class Beliefs(ABC):
         """Return the state after the arrival of these packets (sensors, …) and no others."""
         failure = None
         if estimator.reads_silence and self.arrival is not None:
-            failure = np.tile(1.0 - self.arrival, packets.shape[-1] // self._runs)
+            copies = packets.shape[-1] // self._runs
+            failure = namespace(self.arrival).tile(1.0 - self.arrival, copies)
+        packets = namespace(state.measurement).asarray(packets)
         return estimator.update(state, Reception(packets, failure=failure))
 
     def _of_parts(self, kind: str, updated: MemoryStates) -> Estimate:
@@ -195,19 +211,18 @@ class Beliefs(ABC):
         ]
         if len(each) == 1:
             return each[0]
-        return Estimate(
-            np.concatenate([estimate.mean for estimate in each]),
-            lambda: np.concatenate([estimate.covariance for estimate in each]),
-        )
+        return _one_after_another(each)
 
     def _of_part(self, part: MemoryPart, updated: Any) -> Estimate:
         """Return an estimate per copy of a part."""
 
         def whole(values: Array) -> Array:
-            apart = np.moveaxis(values.reshape(*values.shape[:-1], part.copies, -1), -2, 0)
+            xp = namespace(values)
+            apart = xp.moveaxis(values.reshape(*values.shape[:-1], part.copies, -1), -2, 0)
             if part.shared and self._places is not None and apart.shape[-1] > 1:
                 apart = apart[..., self._places]
-            return np.broadcast_to(apart, (*apart.shape[:-1], self._runs))
+            result: Array = xp.broadcast_to(apart, (*apart.shape[:-1], self._runs))
+            return result
 
         estimator = part.estimator
         mean = whole(estimator.mean(updated))
@@ -249,15 +264,11 @@ class SchedulerBeliefs(Beliefs):
         """x̂(s); with ``packet="estimate"`` it is x* for every s."""
         self.task.refuse_delay(ONE_STEP)
         if self.task.packet == "estimate":
-            return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
+            return Estimate(*(part.repeat(self.task.sensors, axis=0) for part in self.best))
         single = self.task.estimator.single_deliveries(self._estimate)
         if single is not None:
             return Estimate(*single)
-        each = [_fused(self.task.estimator, updated) for updated in self._sent]
-        return Estimate(
-            np.concatenate([item.mean for item in each]),
-            lambda: np.concatenate([item.covariance for item in each]),
-        )
+        return _one_after_another([_fused(self.task.estimator, own) for own in self._sent])
 
     @cached_property
     def best(self) -> Estimate:
@@ -301,8 +312,8 @@ class OwnBeliefs(Beliefs):
         silence = self._no_packets(self._runs)
         received = _fused(estimator, self.update(estimator, self._estimate, silence))
         return Estimate(
-            np.repeat(received.mean, sensors, axis=0),
-            lambda: np.repeat(received.covariance, sensors, axis=0),
+            received.mean.repeat(sensors, axis=0),
+            lambda: received.covariance.repeat(sensors, axis=0),
         )
 
     @cached_property
@@ -343,20 +354,24 @@ class OwnBeliefs(Beliefs):
     def delivered(self, arrived: Packets, name: str) -> Any:
         """Return the state of a part "single" after packets (sensors, N)."""
         part, state = self._parts[name], self._states[name]
-        packets = part.rows(np.tile(arrived, part.copies)) & part.itself(state)
+        xp = namespace(arrived)
+        packets = part.rows(xp.tile(arrived, part.copies)) & part.itself(state)
         if len(self._known) < 2 or part.estimator.reads_silence:
             return self.update(part.estimator, state, packets)
-        runs = np.flatnonzero(packets.any(0))
-        return _merged(self._known[False][name], self._known[True][name], runs)
+        choose = partial(xp.where, packets.any(0))
+        return map_arrays(choose, self._known[True][name], self._known[False][name])
 
     @cached_property
     def _known(self) -> dict[bool, MemoryStates]:
         return {}
 
 
-def _merged(state: Any, other: Any, runs: NDArray[np.int64]) -> Any:
-    """Return a state with the columns ``runs`` of another one."""
-    return merge_runs(state, take_runs(other, runs), runs) if runs.size else state
+def _one_after_another(each: list[Estimate]) -> Estimate:
+    xp = namespace(each[0].mean)
+    return Estimate(
+        xp.concatenate([estimate.mean for estimate in each]),
+        lambda: xp.concatenate([estimate.covariance for estimate in each]),
+    )
 
 
 def _fused(estimator: Estimator[Any], updated: Any) -> Estimate:
@@ -368,14 +383,17 @@ def _joined(first: Estimate, second: Estimate) -> Estimate:
     """Return the covariance intersection of two estimates of each sensor."""
     sensors, states, runs = first.mean.shape
 
+    xp = namespace(first.mean)
+
     def flat(array: Array) -> Array:
-        return np.moveaxis(array, 0, -2).reshape(*array.shape[1:-1], sensors * runs)
+        result: Array = xp.moveaxis(array, 0, -2).reshape(*array.shape[1:-1], sensors * runs)
+        return result
 
     fused = covariance_intersection(
         flat(first.mean), flat(first.covariance), flat(second.mean), flat(second.covariance)
     )
     shape = (sensors, runs)
     return Estimate(
-        np.moveaxis(fused.mean.reshape(states, *shape), -2, 0),
-        np.moveaxis(fused.covariance.reshape(states, states, *shape), -2, 0),
+        xp.moveaxis(fused.mean.reshape(states, *shape), -2, 0),
+        xp.moveaxis(fused.covariance.reshape(states, states, *shape), -2, 0),
     )

@@ -14,7 +14,7 @@ import io
 import os
 import pickle
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.memory import Memory
-from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.rows import RowStep
 from fusion_gym.core.task import Task
 from fusion_gym.errors import ConfigurationError
@@ -39,35 +37,29 @@ _PACKAGE = Path(__file__).parent.parent
 _LOADED: dict[str, tuple[Any, int]] = {}  # engines and addresses
 
 
-def make_step(task: Task, memory: Memory, layout: ObservationLayout) -> CompiledStep | None:
+def make_step(task: Task, *parts: Any) -> CompiledStep | None:
     """Return the compiled step, or ``None`` with a warning for a task that NumPy alone runs."""
     try:
         task.refuse_jax()
-        if memory.parts:
-            raise LoweringError("it has beliefs")
-        return CompiledStep(task, memory, layout)
+        return CompiledStep(task, *parts)
     except (ConfigurationError, LoweringError) as error:
         warnings.warn(f"backend='compiled' runs under NumPy here: {error}", stacklevel=2)
         return None
 
 
 class CompiledStep(RowStep):
-    """A step in machine code.
-
-    Args:
-        task: The task.
-        memory: A memory without states.
-        layout: The layout of the observation.
+    """A step in machine code, with the arguments of :class:`RowStep`.
 
     Raises:
         LoweringError: The step has a primitive that is not lowered, or too many instructions.
         ConfigurationError: JAX is absent, and the code is not in the cache.
     """
 
-    def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
-        super().__init__(task, memory, layout)
+    def __init__(self, task: Task, *parts: Any) -> None:
+        super().__init__(task, *parts)
         self._last: tuple[Any, int] = None, 0  # rows and their address
         self._functions: dict[str, Any] = {}
+        self._sensors = task.sensors
         for kind in ("start", "assign" if task.network.rule.by_channel else "request"):
             self._function(kind)
 
@@ -82,57 +74,89 @@ class CompiledStep(RowStep):
         """
         inputs = [np.ascontiguousarray(part) for part in (start, noise, price, limit)]
         rows = np.empty((len(price), self.width))
-        self._function("start")(len(rows), *(part.ctypes.data for part in (*inputs, rows)))
+        self._function("start")(len(rows), *map(_address, (*inputs, rows)))
         return rows
 
     def __call__(self, rows: Array, requests: NDArray[Any], noise: Array) -> Array:
         """Return the rows after a step with requests (sensors, N) and noise (channels, N)."""
-        flags = requests.dtype == np.bool_
+        flags, shape = requests.dtype == np.bool_, (self._sensors, len(rows))
+        if requests.shape != shape:
+            requests = np.broadcast_to(requests, shape)
         requests = np.ascontiguousarray(requests, np.bool_ if flags else np.int64)
         noise, after = np.ascontiguousarray(noise), np.empty(rows.shape)
         last, address = self._last
-        before = address if rows is last else rows.ctypes.data
-        self._last = after, after.ctypes.data
-        self._function("request" if flags else "assign")(
-            len(after), before, requests.ctypes.data, noise.ctypes.data, self._last[1]
-        )
+        inputs = address if rows is last else _address(rows), _address(requests), _address(noise)
+        address = _address(after)
+        self._last = after, address
+        self._function("request" if flags else "assign")(len(after), *inputs, address)
         return after
 
     def _function(self, kind: str) -> Any:
         """Return the machine code of a start, or of a step with requests or assigned channels."""
         if kind not in self._functions:
-            key = self.runs[0], self.runs[1].owner, kind
-            address = _machine_code(key, functools.partial(self._text, kind))
-            pointers = [ctypes.c_void_p] * (5 if kind == "start" else 4)
-            self._functions[kind] = ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(address)
+            whole, real = np.dtype(np.int64), self.noise.dtype
+            if kind == "start":
+                inputs: Any = self.start_noise, self.noise, np.zeros(1), np.zeros(1, whole)
+                sources = [Buffer(array.dtype, [array]) for array in inputs]
+            else:
+                flags = kind == "request"
+                requests = np.zeros((self._sensors, 1), np.bool_ if flags else whole)
+                sources = [Buffer(real, self.inputs, self.width), Buffer(real, [self.noise])]
+                sources.insert(1, Buffer(np.dtype(np.int8) if flags else whole, [requests]))
+            name = "start_arrays" if kind == "start" else "step_arrays"
+            self._functions[kind] = compile_function(
+                (self.runs[0], self.runs[1].owner, kind),
+                lambda jitted, *parts: getattr(jitted, name)(self, *parts),
+                sources,
+                [Buffer(real, self.arrays, self.width)],
+            )
         return self._functions[kind]
 
-    def _text(self, kind: str) -> str:
-        """Return the assembly of a start or step."""
-        require("the first start of backend='compiled'", "compiled", "jax")
-        from fusion_gym.core import jitted
 
-        whole = np.dtype(np.int64)
-        if kind == "start":
-            inputs: Any = self.start_noise, self.noise, np.zeros(1), np.zeros(1, whole)
-            sources = [Buffer(array.dtype, [array]) for array in inputs]
-            function: Any = jitted.start_arrays
-        else:
-            requests = np.zeros((self.runs[0].sensors, 1), whole if kind == "assign" else np.bool_)
-            inputs = self.moved, requests, self.noise
-            kinds = whole if kind == "assign" else np.dtype(np.int8), self.noise.dtype
-            sources = [Buffer(self.noise.dtype, self.moved, self.width)]
-            sources += [Buffer(k, [x]) for k, x in zip(kinds, inputs[1:], strict=True)]
-            function = jitted.step_arrays
-        try:
-            closed = jitted.jax.make_jaxpr(functools.partial(function, self))(*inputs)
-        except Exception as error:  # of a user's plant or estimator
-            text = " ".join(f"{type(error).__name__}: {error}".split())
-            raise LoweringError(f"JAX cannot trace it ({text[:200]})") from error
-        return assembly(closed, sources, [Buffer(self.noise.dtype, self.arrays, self.width)])
+def _address(array: Any) -> int:
+    """Return the address of a contiguous array, by the fastest way that the array allows."""
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    except (TypeError, ValueError):  # read-only or empty
+        return int(array.ctypes.data)
 
 
 # --- code -----------------------------------------------------------------------------------------
+
+
+def compile_function(
+    key: Any,
+    function: Callable[..., list[Any]],
+    sources: Sequence[Buffer],
+    sinks: Sequence[Buffer],
+) -> Any:
+    """Return a function ``(runs, sources, sinks)`` in machine code.
+
+    Args:
+        key: What determines the function, for the cache.
+        function: A function of :mod:`fusion_gym.core.jitted` and the arrays of one run.
+        sources: Memory of these arrays, each alone or all of a row.
+        sinks: Memory of the results.
+
+    Raises:
+        LoweringError: JAX cannot trace it, or it is not lowered.
+        ConfigurationError: JAX is absent, and the code is not in the cache.
+    """
+    inputs = [buffer.arrays if buffer.length else buffer.arrays[0] for buffer in sources]
+
+    def source() -> str:
+        require("the first start of backend='compiled'", "compiled", "jax")
+        from fusion_gym.core import jitted
+
+        try:
+            closed = jitted.jax.make_jaxpr(functools.partial(function, jitted))(*inputs)
+        except Exception as error:  # of a user's plant, estimator or rule
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            raise LoweringError(f"JAX cannot trace it ({text[:200]})") from error
+        return assembly(closed, sources, sinks)
+
+    pointers = [ctypes.c_void_p] * (len(sources) + len(sinks))
+    return ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(_machine_code(key, source))
 
 
 def _machine_code(task: Any, source: Callable[[], str]) -> int:
@@ -170,7 +194,9 @@ def _read(key: str) -> bytes | None:
 def _compile(text: str) -> bytes:
     """Return the object code of a module in assembly."""
     machine, module = _machine(), llvm.parse_assembly(text)
-    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options.slp_vectorization = True
+    builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
     code: bytes = machine.emit_object(module)
     return code

@@ -7,7 +7,6 @@ JAX's ``jax_compilation_cache_dir``, by default ``~/.cache/fusion-gym/jax``.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,11 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, arrays_of, map_arrays
-from fusion_gym.core.memory import Memory
-from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.rows import RowStep
 from fusion_gym.core.runs import Branch, Position, advance, start_of
-from fusion_gym.core.task import Task
 from fusion_gym.importing import require
 
 require("an environment under JAX", "jax", "jax")
@@ -68,16 +64,10 @@ def refuse_in_forks(owner: type, *methods: str) -> None:
 
 
 class JittedStep(RowStep):
-    """A step that JAX compiles.
+    """A step that JAX compiles, with the arguments of :class:`RowStep`."""
 
-    Args:
-        task: The task.
-        memory: A memory without states.
-        layout: The layout of the observation.
-    """
-
-    def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
-        super().__init__(task, memory, layout)
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
         self._program = jax.jit(self._trace)
 
     def __call__(self, rows: Array, requests: NDArray[Any], noise: Array) -> Array:
@@ -85,7 +75,7 @@ class JittedStep(RowStep):
         return np.asarray(self._program(rows, requests, noise))
 
     def _trace(self, rows: Any, requests: Any, noise: Any) -> Any:
-        arrays = arrays_of(self.position(rows))
+        arrays = arrays_of(self.moved(rows))
         results = step_arrays(self, arrays, requests, noise)
         results[-1] = results[-1].T
         return jnp.concatenate([x.reshape(-1, len(rows)) for x in results], dtype=np.float64).T
@@ -94,20 +84,32 @@ class JittedStep(RowStep):
 refuse_in_forks(JittedStep, "__call__")
 
 
-def start_arrays(step: RowStep, noise: Any, first: Any, price: Any, limit: Any) -> list[Any]:
-    """Return the arrays of a row at a start, from noise, price and limit of steps."""
+def begin(step: RowStep, noise: Any, first: Any, price: Any, limit: Any) -> Branch:
+    """Return a run at the start of an episode, from noise, price and limit of steps."""
     task = step.runs[0]
-    begun = map_arrays(jnp.asarray, start_of(task, noise)[0])
+    begun, announcement = start_of(task, noise)
+    begun = map_arrays(jnp.asarray, begun)
     steps: Any = jnp.zeros(len(price), dtype=np.int64)
     position = Position(advance(task, begun, first, steps), price, steps, limit)
     position = map_arrays(jnp.asarray, position)
-    return [*arrays_of(position), *step.results, Branch(*step.runs, position).observe()]
+    measured = (task.plant.measurement(part.plant) for part in (begun, position.state))
+    memory = step.begin_memory(announcement, *measured)
+    memory.states = map_arrays(jnp.asarray, memory.states)
+    return Branch(task, memory, step.runs[2], position)
+
+
+def start_arrays(step: RowStep, *inputs: Any) -> list[Any]:
+    """Return the arrays of a row at the start of :func:`begin`."""
+    branch = begin(step, *inputs)
+    moved = branch.position(), branch.memory.states
+    return [*arrays_of(moved), *step.results, branch.observe()]
 
 
 def step_arrays(step: RowStep, arrays: Sequence[Any], requests: Any, noise: Any) -> list[Any]:
     """Return the arrays of a row after a step, from a position's arrays, requests and noise."""
-    values = iter(arrays)
-    branch = Branch(*step.runs, map_arrays(lambda _: next(values), step.template))
+    values, (task, memory, layout) = iter(arrays), step.runs
+    position, states = map_arrays(lambda _: next(values), step.template)
+    branch = Branch(task, memory.with_states(states), layout, position)
     outcome = branch.step(requests, noise)
-    states = arrays_of(branch.position()), outcome, arrays_of(branch.delivered)
-    return [*itertools.chain(*states), branch.observe()]
+    moved = branch.position(), branch.memory.states
+    return [*arrays_of(moved), *outcome, *arrays_of(branch.delivered), branch.observe()]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import validation
-from fusion_gym.arrays import Array, merge_runs, take_runs
+from fusion_gym.arrays import Array, Lazy, merge_runs, take_runs, value_of
 from fusion_gym.core.beliefs import (
     Beliefs,
     Estimate,
@@ -34,6 +34,7 @@ from fusion_gym.core.beliefs import (
 from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
+from fusion_gym.namespace import namespace
 
 
 class Memory:
@@ -48,7 +49,6 @@ class Memory:
 
     Attributes:
         parts: Parts of the memory, by name.
-        states: Their states after sensing, by name.
         places: Columns (N,) of the runs in the private parts' states; ``None`` is one per run.
 
     Raises:
@@ -77,10 +77,20 @@ class Memory:
         ):
             self._add("single", task.estimator, private=False)
         self.keeps_every = "every" in self.parts
-        self.states: MemoryStates = {}
+        self.states = {}
         self.places: NDArray[np.int64] | None = None
         self._first: NDArray[np.int64] | None = None  # a run of each column
         self._beliefs: Beliefs | None = None
+
+    @property
+    def states(self) -> MemoryStates:
+        """The parts' states after sensing, by name."""
+        states: MemoryStates = value_of(self._states)
+        return states
+
+    @states.setter
+    def states(self, states: Any) -> None:
+        self._states = states
 
     def _add(self, name: str, estimator: Any, private: bool) -> None:
         """Add a part for each sensor where the estimator allows it, else one with copies."""
@@ -163,7 +173,7 @@ class Memory:
             if part.shared and self._first is not None:
                 own = own[..., self._first]
             if part.copies > 1:
-                own = np.tile(own, part.copies)
+                own = namespace(own).tile(own, part.copies)
             states[name] = part.estimator.observe(part.estimator.predict(state), own)
         self.states = states
 
@@ -186,7 +196,7 @@ class Memory:
             }
         )
 
-    def with_states(self, states: MemoryStates) -> Self:
+    def with_states(self, states: MemoryStates | Lazy) -> Self:
         """Return a memory of other runs with these states, a column for each run."""
         result = copy.copy(self)
         result.states = states
@@ -228,6 +238,6 @@ class Memory:
             if name.startswith("single"):
                 result[name] = own.delivered(arrived, name)
                 continue
-            packets = np.tile(arrived, part.copies) | part.itself(state)
+            packets = namespace(arrived).tile(arrived, part.copies) | part.itself(state)
             result[name] = beliefs.update(part.estimator, state, packets)
         return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,12 +110,15 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
     whole = float((task.relative_weights * nominal).sum())
 
     def difference(beliefs: Beliefs) -> Array:
-        return np.arcsinh(_DIFFERENCE * beliefs.difference / deviation)
+        scaled = _DIFFERENCE * beliefs.difference / deviation
+        return cast(Array, namespace(scaled).arcsinh(scaled))
 
     def value(beliefs: Beliefs) -> Array:
-        silent = np.broadcast_to(beliefs.loss, (task.sensors, beliefs.loss.shape[-1]))
-        both = np.stack((silent, beliefs.value), axis=1) / whole
-        return _VALUE * np.sign(both) * np.sqrt(np.abs(both))
+        xp, runs = namespace(beliefs.loss), beliefs.loss.shape[-1]
+        silent = xp.broadcast_to(beliefs.loss, (task.sensors, runs))
+        both = xp.stack((silent, beliefs.value), axis=1) / whole
+        root = _VALUE * xp.sqrt(abs(both))
+        return cast(Array, xp.where(both < 0.0, -root, root))
 
     states, nodes = task.plant.state_names, numbered(task.sensors)
     differences = partial(
@@ -143,7 +146,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
 
         def scheduler_values(beliefs: Beliefs) -> Array:
             silent, sent = value(beliefs).swapaxes(0, 1)
-            return np.concatenate((silent[:1], sent))
+            return cast(Array, namespace(sent).concatenate((silent[:1], sent)))
 
         result = {
             "difference": differences(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, arrays_of, map_arrays
+from fusion_gym.core.beliefs import MemoryStates
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Outcome, Position, State, advance, start_of
@@ -19,12 +20,12 @@ from fusion_gym.core.task import Task
 class RowStep:
     """A step between rows (N, entries), and the places of a row's arrays.
 
-    A row has the arrays of a position, of the outcome of the step to it and of the state after the
-    delivery, and its observation.
+    A row has the arrays of a position and of the memory, of the outcome of the step to it and of
+    the state after the delivery, and its observation.
 
     Args:
         task: The task.
-        memory: A memory without states.
+        memory: The memory; its states are not used.
         layout: The layout of the observation.
     """
 
@@ -34,19 +35,23 @@ class RowStep:
         self.noise = np.zeros((plant.noise_channels + network.noise_channels, 1))
         number, steps = np.zeros(1), np.zeros(1, dtype=np.int64)
         with np.errstate(all="ignore"):
-            state = advance(task, start_of(task, self.start_noise)[0], self.noise, steps)
-            self.template = Position(state, number, steps, steps)
-            branch = Branch(*self.runs, self.template)
+            start, announcement = start_of(task, self.start_noise)
+            state = advance(task, start, self.noise, steps)
+            measured = (plant.measurement(part.plant) for part in (start, state))
+            memory = self.begin_memory(announcement, *measured)
+            self.template = Position(state, number, steps, steps), memory.states
+            branch = Branch(task, memory, layout, self.template[0])
             branch.deliver(np.zeros((task.sensors, 1), np.bool_))
-        self._delivered, flags = branch.delivered, np.zeros((task.sensors, 1), np.bool_)
+            self._delivered = branch.delivered
+        flags: Any = np.zeros((task.sensors, 1), np.bool_)
         errors: Any = np.zeros((len(plant.state_names), 1))
         observation = np.zeros((len(layout.names), 1), np.float32)
-        self.moved = arrays_of(self.template)
+        self.inputs = arrays_of(self.template)
         outcome = [*[number] * 4, *[flags] * 3, errors, errors, *[flags[0]] * 2]
         self.results = [*outcome, *arrays_of(self._delivered)]
-        self.arrays = [*self.moved, *self.results, observation]
+        self.arrays = [*self.inputs, *self.results, observation]
         *self._places, self._entries = _places(self.arrays)
-        first = len(self.moved)
+        first = len(self.inputs)
         own, self._after = self._places[first : first + len(outcome)], first + len(outcome)
         self._span = slice(own[0].start, own[-1].stop)
         self._fields = [  # whether a field of the outcome is a flag, and its place
@@ -65,17 +70,23 @@ class RowStep:
         """Number of entries of a row."""
         return int(self._entries.stop)
 
-    def pack(self, position: Position) -> Array:
-        """Return the rows of a position."""
+    def begin_memory(self, announcement: Any, first: Any, measurement: Any) -> Memory:
+        """Return the memory of one run after the plant's announcement and two measurements."""
+        memory = self.runs[1].with_states({})
+        memory.begin(first, announcement, measurement, np.arange(1), [0], 1)
+        return memory
+
+    def pack(self, position: Position, memory: MemoryStates) -> Array:
+        """Return the rows of a position and of the memory's states."""
         rows = np.zeros((len(position.steps), self.width))
-        for place, array in zip(self._places, arrays_of(position), strict=False):
+        for place, array in zip(self._places, arrays_of((position, memory)), strict=False):
             rows[:, place] = array.reshape(-1, len(rows)).T
         return rows
 
-    def position(self, rows: Array) -> Position:
-        """Return the position of rows."""
-        position: Position = self._unpack(rows, self.template, 0)
-        return position
+    def moved(self, rows: Array) -> tuple[Position, MemoryStates]:
+        """Return the position and the memory's states of rows."""
+        moved: tuple[Position, MemoryStates] = self._unpack(rows, self.template, 0)
+        return moved
 
     def delivered(self, rows: Array) -> State:
         """Return the states after the delivery of rows."""
@@ -91,16 +102,16 @@ class RowStep:
 
         return map_arrays(part, template)
 
-    def result(self, rows: Array) -> tuple[Outcome, NDArray[np.float32]]:
-        """Return the outcome and the observations (entries, N) of rows."""
-        numbers = rows.T[self._span].copy()  # or a stored reward would keep the rows
-        both: tuple[Any, Any] = numbers, numbers != 0.0
-        outcome = Outcome(*[both[flag][place] for flag, place in self._fields])
-        return outcome, self.observation(rows)
+    def outcome(self, rows: Array, run: int | None = None) -> Outcome:
+        """Return the outcome of the step to rows, or to one row without the batch axis."""
+        row = slice(None) if run is None else run
+        numbers = rows[row, self._span].T.copy()  # or a stored reward would keep the rows
+        flags: Any = numbers.astype(np.bool_)
+        return Outcome._make([(flags if flag else numbers)[at] for flag, at in self._fields])
 
     def observation(self, rows: Array) -> NDArray[np.float32]:
-        """Return the observations (entries, N) of rows."""
-        return rows[:, self._entries].astype(np.float32).T
+        """Return new observations (N, entries) of rows."""
+        return rows[:, self._entries].astype(np.float32)
 
 
 def _places(arrays: Sequence[NDArray[Any]]) -> list[slice]:

@@ -6,14 +6,13 @@ Both halves make new arrays and change none, so runs can branch on other noise.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym.arrays import Array, merge_runs, take_runs
+from fusion_gym.arrays import Array, merge_runs, take_runs, value_of
 from fusion_gym.core.access import discrepancy, place_of
 from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.estimator import Reception
@@ -57,6 +56,10 @@ class Outcome(NamedTuple):
     diverged: NDArray[np.bool_]
     ended: NDArray[np.bool_]
 
+    def single(self, run: int) -> Outcome:
+        """Return the outcome of one run, without the batch axis."""
+        return Outcome._make(part.T[run].copy() for part in self)
+
 
 class State(NamedTuple):
     """The states of plant, estimator and network of N runs after sensing.
@@ -92,26 +95,6 @@ class Position(NamedTuple):
     price: Array
     steps: NDArray[np.int64]
     limit: NDArray[np.int64]
-
-
-class Lazy:
-    """A value that is computed on first access."""
-
-    def __init__(self, compute: Callable[[], Any]) -> None:
-        self._compute = compute
-
-    @functools.cached_property
-    def value(self) -> Any:
-        """The value."""
-        return self._compute()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"value": self.value}
-
-
-def value_of(value: Any) -> Any:
-    """Return the value of a :class:`Lazy`, and any other value as it is."""
-    return value.value if isinstance(value, Lazy) else value
 
 
 class Runs:

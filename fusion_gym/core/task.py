@@ -300,8 +300,7 @@ class Task:
         """
         kind, own = type(self.estimator).__name__, (self.plant, self.estimator)
         fields = [part.numpy_only for part in own if part.numpy_only is not None]
-        fields += [*self.plant.nature.departing, *(["memory"] if self.memory else [])]
-        fields += ["belief_features"] if self.belief_features else []
+        fields += self.plant.nature.departing
         fields += ["acknowledgements"] if self.network.acknowledgement < 1.0 else []
         fields += ["delay"] if len(self.network.delay) > 1 else []
         fields += ["error"] if callable(self.reward.error) else []

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
 from fusion_gym.envs import vector
@@ -93,7 +94,8 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
         if self._film is not None:
             self._film.begin()
             self._show()
-        return self.batch.observe()[0], _first(vector.reset_infos(self.task, 1))
+        outcome = vector.reset_outcome(self.task, 1).single(0)
+        return self.batch.observe()[0], vector.step_infos(outcome)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], Any, bool, bool, vector.Infos]:
         """Make one step.
@@ -110,14 +112,14 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
         """
         if self.batch.finished[0]:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
-        outcome = self.batch.step(self.view.requests(action, None))
+        outcome = self.batch.step(self.view.requests(action, None), 0)
         if self._film is not None:
-            self._film.record(self.batch, outcome)
+            self._film.record(self.batch, Outcome._make(part[..., None].copy() for part in outcome))
             self._show()
         observation = self.batch.observe()[0]
-        infos = _first(vector.step_infos(outcome))
-        ended, clock = bool(outcome.ended[0]), self.task.clock
-        reward = vector.rewards_of(self.task, outcome)[0]
+        infos = vector.step_infos(outcome)
+        ended, clock = bool(outcome.ended), self.task.clock
+        reward: Any = vector.rewards_of(self.task, outcome)
         if not self.task.vector_reward:
             reward = float(reward)
         return observation, reward, ended and clock, ended and not clock, infos
@@ -159,18 +161,3 @@ def _warn_of_single_steps() -> None:
         "fusion_gym.make_sb3_vec_env(id, 64) steps 64 in one batch, many times faster",
         stacklevel=3,
     )
-
-
-def _first(infos: vector.Infos) -> vector.Infos:
-    """Return the info of the only run, each value with a ``dtype`` and without the batch axis.
-
-    TorchRL reads the ``dtype``. A flag is an array of shape (), because Gymnasium's vector
-    environments turn NumPy's scalar flags into objects.
-
-    Args:
-        infos: The info of a batch with one run.
-    """
-    return {
-        key: value[0] if key in vector.NUMBERS else np.array(value[0])
-        for key, value in infos.items()
-    }

@@ -148,7 +148,8 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         self._started |= mask
         if self._film is not None:
             self._film.begin(runs)
-        return self.batch.observe(), _with_mask(reset_infos(self.task, self.num_envs), mask)
+        infos = step_infos(reset_outcome(self.task, self.num_envs))
+        return self.batch.observe(), _with_mask(infos, mask)
 
     def render(self) -> tuple[Frame, ...] | None:
         """Return a picture (height, width, 3) of every run, or ``None`` without a render mode."""
@@ -288,11 +289,12 @@ def reward_space() -> Box:
     return Box(-np.inf, 0.0, (2,), np.float64)
 
 
-NUMBERS = frozenset({"cost", "cost_tokens", "reward_error", "reward_cost"})  # of an info
-
-
 def step_infos(outcome: Outcome) -> Infos:
-    """Return the info of a step as arrays with the batch axis first, without masks."""
+    """Return the info of a step as arrays with the batch axis first, without masks.
+
+    TorchRL reads the ``dtype`` of every value. The flag of one run is an array of shape (), because
+    Gymnasium's vector environments turn NumPy's scalar flags into objects.
+    """
     return {
         "cost": outcome.cost,
         "cost_tokens": outcome.cost,
@@ -302,17 +304,16 @@ def step_infos(outcome: Outcome) -> Infos:
         "arrived": outcome.arrived.T,
         "denied": (outcome.requested > outcome.granted).T,
         "squared_error": outcome.squared_error.T,
-        "diverged": outcome.diverged,
+        "diverged": outcome.diverged[...],
     }
 
 
-def reset_infos(task: Task, num_envs: int) -> Infos:
-    """Return the info of a reset: zeros, as in a step without requests and errors."""
+def reset_outcome(task: Task, num_envs: int) -> Outcome:
+    """Return the outcome of a reset: zeros, as in a step without requests and errors."""
     none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
     silence = np.zeros((task.sensors, num_envs), dtype=np.bool_)
     error = np.zeros((len(task.plant.state_names), num_envs))
-    outcome = Outcome(none, none, none, none, silence, silence, silence, error, error, never, never)
-    return step_infos(outcome)
+    return Outcome(none, none, none, none, silence, silence, silence, error, error, never, never)
 
 
 def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:

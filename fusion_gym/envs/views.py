@@ -22,6 +22,7 @@ from fusion_gym.core.observation import ObservationEntry, ObservationLayout
 from fusion_gym.core.task import Task
 from fusion_gym.errors import ConfigurationError, display, refusal
 
+_ONE = np.array(1, np.int8)  # which NumPy compares in half the time of a Python number
 Rows = NDArray[np.float32]
 Requests = NDArray[np.bool_]
 Actions: TypeAlias = "spaces.MultiBinary | spaces.MultiDiscrete | spaces.Discrete[Any]"
@@ -78,8 +79,7 @@ class SchedulerView:
             _whole(array, self._sensors)
             return channel_requests(array.reshape(-1, *shape).T, self._sensors)
         if not isinstance(self.actions, spaces.Discrete):
-            requests = _bits(array)
-            return np.ascontiguousarray((requests[None] if runs is None else requests).T)
+            return np.ascontiguousarray(_bits(array).reshape(-1, self._sensors).T)
         _whole(array, int(self.actions.n) - 1)
         return self._decoded(array.astype(np.int64).reshape(-1))
 
@@ -224,10 +224,9 @@ def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 def _bits(values: NDArray[Any]) -> Requests:
     """Return where the actions are 1; the others must be 0."""
-    requests: Requests = values == 1
-    silences = values == 0
-    if np.count_nonzero(requests) + np.count_nonzero(silences) < values.size:
-        _check(values, requests | silences, "0 or 1")
+    requests: Requests = values == _ONE
+    if np.count_nonzero(requests) < np.count_nonzero(values):
+        _check(values, requests | (values == 0), "0 or 1")
     return requests
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Owner
+from fusion_gym.core.beliefs import DerivedBeliefs, Owner
 from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signals
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
@@ -355,26 +355,9 @@ def _part(whole: Signals, runs: Runs) -> Signals:
 
 def _take(whole: Signals, name: str, runs: Runs) -> Any:
     value: Any = whole[name]
-    if isinstance(value, Beliefs):
-        return _Part(value, runs)
+    if name in ("beliefs", "own_beliefs"):
+        return DerivedBeliefs(lambda attribute: take_runs(getattr(value, attribute), runs))
     if name == "token_cost":  # the same for all runs
         return value
     # The observation has the batch first.
     return value[runs] if name == "observation" else take_runs(value, runs)
-
-
-def _of_runs(name: str) -> Any:
-    return property(lambda part: take_runs(getattr(part._whole, name), part._choices))
-
-
-class _Part(Beliefs):
-    """The beliefs of some runs."""
-
-    silent, sent, best = _of_runs("silent"), _of_runs("sent"), _of_runs("best")
-    memory_posterior, memory_states = _of_runs("memory_posterior"), _of_runs("memory_states")
-    loss, value = _of_runs("loss"), _of_runs("value")
-
-    def __init__(self, whole: Beliefs, runs: Runs) -> None:
-        self.task = whole.task
-        self.arrival = take_runs(whole.arrival, runs)
-        self._whole, self._choices = whole, runs

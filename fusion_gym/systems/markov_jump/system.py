@@ -311,7 +311,9 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         )
         return replace(
             state,
-            measurement=namespace(sampled).where(sampled[:, None], measurement, np.nan),
+            measurement=namespace(sampled, measurement).where(
+                sampled[:, None], measurement, np.nan
+            ),
             innovation=innovation,
             node_mean=mean,
             node_noise=noise_mean,
