@@ -3,15 +3,17 @@
 import dataclasses
 import functools
 import json
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 import fusion_gym
+from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation import rule_search
+from fusion_gym.evaluation import rule_loop, rule_search
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced, run_several
+from fusion_gym.evaluation.rule_loop import make_loop
 from fusion_gym.evaluation.rule_search import (
     Generation,
     RuleSearch,
@@ -22,6 +24,7 @@ from fusion_gym.evaluation.rule_search import (
     search_rule,
     try_thresholds,
 )
+from fusion_gym.policies.base import Requests, Rule, shape_of
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -115,7 +118,6 @@ def seeds(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
     def policies(task: Task, rules: Any, episodes: int, seed: int) -> list[EpisodeResults]:
         return [policy(task, None, episodes, seed)] * len(rules)
 
-    monkeypatch.setattr(rule_search, "run_episodes", policy)
     monkeypatch.setattr(rule_search, "run_several", policies)
     monkeypatch.setattr(rule_search, "run_priced", lambda task, policy, seeds, prices: means(seeds))
     return batches
@@ -127,7 +129,7 @@ def test_a_search_runs_no_episode_twice(seeds: list[set[int]]) -> None:
     phases = [batch for place, batch in enumerate(seeds) if batch not in seeds[:place]]
     assert [len(batch) for batch in phases] == [16, 4, 5, 6, 8, 32]
     assert len(set().union(*phases)) == sum(map(len, phases))
-    assert phases[-1] == seeds[-len(PRICES) - 1]
+    assert phases[-1] == seeds[-1] == seeds[-2]
 
 
 @pytest.mark.usefixtures("seeds")
@@ -172,6 +174,103 @@ def test_trials_are_what_each_policy_does_alone() -> None:
         ConfigurationError, match=r"template = 'always' .*: it must be a policy with"
     ):
         try_thresholds(task, "always", values, 2, 0)
+
+
+LOOP_RULES = (
+    *("innovation_threshold:threshold={value},whitened=true", "send_on_delta:threshold={value}"),
+    *("variance_threshold:threshold={value},at_most=1", "information_gain:threshold={value}"),
+    *("estimate_difference:threshold={value}", "kullback_leibler:threshold={value},at_most=1"),
+    *("value_of_information:own=true,threshold={value}", "paced:rate={value}"),
+    *("innovation_threshold:threshold={value}", "value_of_information:threshold={value}"),
+    "priced_threshold:threshold={value},margin=1.5,token_exponent=-0.3,reference_price=0.1",
+)
+LOOP_TASKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "tobit": ("TobitOscillator-v1", {"filter": "tobit", "memory": True, "token_rate": 2.0}),
+    "linear": (
+        "LinearFusion-v2",
+        {"memory": True, "cost_weight": "random", "price_range": (0.01, 1.0)},
+    ),
+    "biased": ("BiasedTracking-v1", {"access": "any", "tokens": "limited", "token_rate": 1.0}),
+    "remote": ("RemoteEstimation-v1", {"sensors": 3, "channel": "gilbert_elliott"}),
+}
+
+
+@pytest.mark.parametrize("name", LOOP_TASKS)
+def test_the_loop_in_machine_code_has_the_figures_of_numpy(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("llvmlite")
+    env_id, options = LOOP_TASKS[name]
+    task, loops = fusion_gym.make_task(f"fusion_gym/{env_id}", horizon=30, **options), []
+    different = 0
+    monkeypatch.setattr(
+        rule_search, "make_loop", lambda *_: loops.append(make_loop(*_)) or loops[-1]
+    )
+    every = LOOP_RULES if name == "tobit" else LOOP_RULES[-4:]
+    for rule in every:
+        values, trials = [0.01, 0.2, 1.5] if "rate" not in rule else [0.1, 0.3, 0.6], []
+        for fewest in (10**9, 0):
+            monkeypatch.setattr(rule_loop, "_FEWEST", fewest)
+            try:
+                trials.append(try_thresholds(task, rule, values, 30, 7))
+            except ConfigurationError:  # a rule of another environment
+                break
+        else:
+            assert loops[-1] is not None
+            numpy, ours = (np.array([(t.tokens, t.error) for t in each]) for each in trials)
+            np.testing.assert_allclose(ours, numpy, rtol=1e-10, err_msg=rule)
+            different += len({*numpy[:, 0]}) > 1
+    assert different > len(every) / 2
+
+
+def test_a_search_in_machine_code_is_the_search_of_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("llvmlite")
+    results = []
+    for fewest in (10**9, 0):
+        monkeypatch.setattr(rule_loop, "_FEWEST", fewest)
+        search = small()
+        assert (search.loop is None) == (fewest > 0)
+        results.append((every := list(run_generations(search)), search_result(search, every)))
+    (numpy, one), (ours, other) = results
+    for first, second in zip(numpy, ours, strict=True):
+        np.testing.assert_allclose(second.objectives, first.objectives, rtol=1e-9)
+        np.testing.assert_allclose(second.mean, first.mean, rtol=1e-7, atol=1e-9)
+    assert other.policy == one.policy
+    np.testing.assert_allclose(other.costs, one.costs, rtol=1e-9)
+    np.testing.assert_allclose(other.threshold_costs, one.threshold_costs, rtol=1e-12)
+
+
+@dataclasses.dataclass
+class EveryOtherStep(Rule):
+    """A rule with a variable."""
+
+    knowledge: ClassVar[Any] = "clock"
+    number: float
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        self.steps = 0
+
+    def __call__(self, signals: Signals) -> Requests:
+        self.steps += 1
+        return np.full(shape_of(signals), self.steps % 2 == 0)
+
+
+@pytest.mark.parametrize(
+    ("rule", "options"),
+    [
+        ("stochastic_event:weight={value}", {}),  # draws numbers
+        ("innovation_threshold:threshold={value}", {"true_process_noise": 2.0}),
+        ("innovation_threshold:threshold={value}", {"delay": 1, "memory": False}),
+    ],
+)
+def test_numpy_runs_what_the_loop_does_not(
+    rule: str, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rule_loop, "_FEWEST", 0)
+    monkeypatch.setattr(rule_loop.RuleLoop, "costs", None)
+    assert len(try_thresholds(task_of(**options), rule, [0.5, 1.0], 3, 0)) == 2
+    alternating = [EveryOtherStep(number) for number in (1.0, 2.0)]
+    assert rule_search._means(task_of(), alternating, 2, 0)[1] == pytest.approx(4.5)
 
 
 def test_coordinates_are_those_that_matter() -> None:

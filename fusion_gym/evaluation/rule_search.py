@@ -13,16 +13,19 @@ strategies", Evolutionary Computation 9, 2001, as in the package cmaes.
 """
 
 import functools
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced, run_several
+from fusion_gym.evaluation.episodes import EpisodeResults, run_priced, run_several
+from fusion_gym.evaluation.rule_loop import RuleLoop, make_loop
 from fusion_gym.importing import require
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.priced_threshold import PricedThreshold, Score, ThresholdNumbers
@@ -174,8 +177,17 @@ class RuleSearch:
         trials = []
         for margin in margins:
             text = f"{self.text},price_exponent=0,margin={margin},threshold={{value}}"
-            trials += try_thresholds(self.task, text, values, 2 * self.episodes[1], self.seed)
+            count = 2 * self.episodes[1]
+            trials += try_thresholds(self.task, text, values, count, self.seed, self.loop)
         return tuple(min(trials, key=lambda t: t.cost(price)) for price in self.prices)
+
+    @functools.cached_property
+    def loop(self) -> RuleLoop | None:
+        """The loop of the rule in machine code, where it saves time."""
+        rule = PricedThreshold(self.task, own=self.own, score=self.score)
+        runs = self.generations * self.population * len(self.prices) * self.episodes[0]
+        sizes = Counter((*self.coordinates, "reference_price"))
+        return make_loop(self.task, rule, sizes, runs * self.task.horizon)
 
     def start_costs(self, trials: Sequence[ThresholdTrial]) -> Array:
         """Return the costs of the trials, each at its price."""
@@ -245,21 +257,54 @@ def search_of_class(
 
 
 def try_thresholds(
-    task: Task, template: str, values: Sequence[float], episodes: int, seed: int
+    task: Task,
+    template: str,
+    values: Sequence[float],
+    episodes: int,
+    seed: int,
+    loop: RuleLoop | None = None,
 ) -> list[ThresholdTrial]:
     """Run a rule with each of several thresholds, ``{value}`` in the template, in one batch."""
     if "{value}" not in template:
         raise validation.refusal("template", template, "a policy with {value} as its threshold")
     texts = [template.replace("{value}", f"{value:.5g}") for value in values]
     rules = [make_policy(text, task) for text in texts]
+    error, tokens = _means(task, rules, episodes, seed, loop)
+    error = np.nan_to_num(error, nan=_WORST, posinf=_WORST)
+    columns = texts, values, tokens.tolist(), error.tolist()
+    return [
+        ThresholdTrial(text, float(f"{value:.5g}"), *means)
+        for text, value, *means in zip(*columns, strict=True)
+    ]
+
+
+def _means(
+    task: Task, rules: Sequence[Any], episodes: int, seed: int, loop: RuleLoop | None = None
+) -> Array:
+    """Return the error and the tokens (2, rules) of each rule, means over its episodes."""
+    rule = rules[0]
+    if loop is None and is_dataclass(rule):
+        sizes = {
+            field.name: np.size(getattr(rule, field.name))
+            for field in fields(rule)
+            if field.name != "task" and len({repr(getattr(own, field.name)) for own in rules}) > 1
+        }
+        loop = make_loop(task, rule, sizes, len(rules) * episodes * task.horizon)
+    if loop is not None:
+        values = {
+            name: np.array([np.broadcast_to(getattr(own, name), size) for own in rules]).T
+            for name, size in loop.sizes.items()
+        }
+        values = {name: column.repeat(episodes, axis=1) for name, column in values.items()}
+        seeds = seed + np.arange(episodes)
+        uniform = [PhiloxNoise().uniform(own, 0) for own in seeds.tolist()]
+        prices = task.reward.price.draw(np.array(uniform))
+        costs = loop.costs(values, np.tile(seeds, len(rules)), np.tile(prices, len(rules)))
+        return costs.reshape(2, len(rules), episodes).mean(-1)
     size, briefs = max(_RUNS // episodes, 1), list[EpisodeResults]()
     for first in range(0, len(rules), size):
         briefs += run_several(task, rules[first : first + size], episodes, seed)
-    return [
-        ThresholdTrial(text, float(f"{value:.5g}"), float(brief.tokens.mean()), error)
-        for text, value, brief in zip(texts, values, briefs, strict=True)
-        for error in np.nan_to_num([brief.error_cost.mean()], nan=_WORST, posinf=_WORST).tolist()
-    ]
+    return np.array([(brief.error_cost.mean(), brief.tokens.mean()) for brief in briefs]).T
 
 
 def search_rule(
@@ -326,12 +371,10 @@ def search_result(search: RuleSearch, generations: Sequence[Generation]) -> Sear
     seed = search.seed + (2 + search.generations) * search.episodes[1]
     rule: Any = make_policy(policy, search.task)
     costs = _costs(search, rule.numbers, episodes, seed)[0]
-    single = [make_policy(item.policy, search.task) for item in search.start]
-    references = [
-        float(run_episodes(search.task, rule, episodes, seed).cost(price).mean())
-        for rule, price in zip(single, search.prices, strict=True)
-    ]
-    return SearchResult(policy, search.prices, tuple(costs.tolist()), tuple(references))
+    single: list[Any] = [make_policy(item.policy, search.task) for item in search.start]
+    error, tokens = _means(search.task, single, episodes, seed, search.loop)
+    references = error + np.array(search.prices) * tokens
+    return SearchResult(policy, search.prices, tuple(costs.tolist()), tuple(references.tolist()))
 
 
 def _objectives(search: RuleSearch, points: Array, episodes: int, seed: int) -> tuple[float, ...]:
@@ -344,12 +387,19 @@ def _costs(search: RuleSearch, numbers: ThresholdNumbers, episodes: int, seed: i
     """Return the costs (K, prices) of the numbers (…, K), on the same episodes."""
     shape = (numbers.margin.shape[-1], len(search.prices), episodes)
     candidate, price, episode = (place.ravel() for place in np.indices(shape))
-    policy = PricedThreshold(search.task, own=search.own, score=search.score)
-    policy.reference_price = search.reference_price
-    costs = np.empty(len(candidate))
-    for first in range(0, len(costs), _RUNS):
-        part = slice(first, first + _RUNS)
-        policy.numbers = ThresholdNumbers(*(column[:, candidate[part]] for column in numbers))
-        prices = np.array(search.prices)[price[part]]
-        costs[part] = run_priced(search.task, policy, seed + episode[part], prices).cost(prices)
+    seeds, prices = seed + episode, np.array(search.prices)[price]
+    if search.loop is not None:
+        columns = numbers._asdict()
+        columns |= {"reference_price": np.full(shape[:1], search.reference_price)[None]}
+        values = {name: columns[name][:, candidate] for name in search.loop.sizes}
+        error, tokens = search.loop.costs(values, seeds, prices)
+        costs = error + prices * tokens
+    else:
+        policy = PricedThreshold(search.task, own=search.own, score=search.score)
+        policy.reference_price, costs = search.reference_price, np.empty(len(candidate))
+        for first in range(0, len(costs), _RUNS):
+            part = slice(first, first + _RUNS)
+            policy.numbers = ThresholdNumbers(*(column[:, candidate[part]] for column in numbers))
+            own = prices[part]
+            costs[part] = run_priced(search.task, policy, seeds[part], own).cost(own)
     return np.nan_to_num(costs, nan=_WORST, posinf=_WORST).reshape(shape).mean(-1)

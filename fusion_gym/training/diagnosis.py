@@ -104,7 +104,7 @@ def threshold_costs(task: Task, local: bool, prices: Sequence[float]) -> Array:
     """Return the cost of the best single threshold of the class at each price; 1 at one price."""
     if len(prices) == 1:
         return np.ones(1)
-    search = search_of_class(class_of(task, local), task, prices, episodes=(16, 16))
+    search = search_of_class(class_of(task, local), task, prices, generations=1, episodes=(16, 16))
     return search.start_costs(search.start)
 
 

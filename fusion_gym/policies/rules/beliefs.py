@@ -1,14 +1,14 @@
 """Rules that use the beliefs of the scheduler or of each sensor."""
 
 from dataclasses import dataclass
-
-import numpy as np
+from typing import Any
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.errors import forbidden
+from fusion_gym.namespace import namespace
 from fusion_gym.policies.base import Requests, check_at_most, check_price, parameter, strongest
 from fusion_gym.policies.belief_rule import BeliefRule
 
@@ -67,7 +67,7 @@ class ValueOfInformation(BeliefRule):
         """Return the requests (sensors, N)."""
         value = self.beliefs(signals).value
         if self.price is None:
-            least = np.asarray(0.03 if self.threshold is None else self.threshold)
+            least: Any = 0.03 if self.threshold is None else self.threshold
         else:
             value = self.task.error_scale * value
             least = self.price * signals["token_cost"]
@@ -124,7 +124,8 @@ class EstimateDifference(BeliefRule):
         """Return the requests (sensors, N)."""
         beliefs, age = self.beliefs(signals), signals["age"]
         squared = _whitened(beliefs) if self.whitened else beliefs.loss
-        requests = np.broadcast_to(squared >= self.threshold * self.threshold, age.shape)
+        due = squared >= self.threshold * self.threshold
+        requests = namespace(due).broadcast_to(due, age.shape)
         if self.own or self.at_most is None:
             return requests.copy()
         return strongest(beliefs.value, requests, self.at_most, age)
@@ -193,4 +194,5 @@ def _divergence(estimate: Estimate, silent: Estimate) -> Array:
 
 
 def _log_determinant(covariance: Array) -> Array:
-    return 2.0 * linalg.total(np.log(linalg.diagonal(linalg.cholesky(covariance))))
+    root = linalg.diagonal(linalg.cholesky(covariance))
+    return 2.0 * linalg.total(namespace(root).log(root))

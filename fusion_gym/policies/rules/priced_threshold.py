@@ -1,13 +1,14 @@
 """Transmit above a threshold that depends on price, tokens and age."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple, get_args
+from typing import ClassVar, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge, Signals
+from fusion_gym.namespace import namespace
 from fusion_gym.policies.base import (
     PerSensor,
     Requests,
@@ -127,24 +128,23 @@ class PricedThreshold(BeliefRule):
         """Return ln r - k ln max{1, s (p/p0)^μ} (sensors, N); a request is at least 0."""
         value, loss = self._scores(signals)
         numbers, bucket = self.numbers, self.task.network.bucket
-        age = np.maximum(signals["age"], 0.0)
+        xp = namespace(value)
+        age = xp.maximum(signals["age"], 0.0)
         price = signals["price"] if self.price is None else np.asarray(self.price)
         level = signals["energy" if bucket.per_sensor else "tokens"]
         tokens = (level + 1.0) / (bucket.capacity + 1.0)
-        price = price / self.reference_price
-        least = numbers.threshold * price**numbers.price_exponent
+        log_price = _log(price / self.reference_price)
+        least = _log(numbers.threshold) + numbers.price_exponent * log_price
         if not bucket.unlimited:
-            least = least * tokens**numbers.token_exponent
-        least = least * ((age + 1.0) / 6.0) ** numbers.age_exponent
-        value, loss = np.maximum(value, 0.0), np.maximum(loss, 0.0)
-        score = value ** (1.0 - numbers.mixture) * loss**numbers.mixture
-        ratio = np.where(value > 0.0, score / np.maximum(least, 1e-300), 0.0)
-        margin = np.maximum(numbers.margin * price**numbers.margin_exponent, 1.0)
-        if not np.all(margin == 1.0):
-            rank = np.argsort(np.lexsort((-age, -ratio), axis=0), axis=0)
-            ratio = np.where(value > 0.0, score / np.maximum(least * margin**rank, 1e-300), 0.0)
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log(ratio))
+            least = least + numbers.token_exponent * xp.log(tokens)
+        least = least + numbers.age_exponent * xp.log((age + 1.0) / 6.0)
+        score = (1.0 - numbers.mixture) * _log(value) + numbers.mixture * _log(loss)
+        ratio = xp.where(value > 0.0, score - least, -np.inf)
+        margin = xp.maximum(_log(numbers.margin) + numbers.margin_exponent * log_price, 0.0)
+        if xp is not np or margin.any():
+            rank = xp.argsort(xp.lexsort((-age, -ratio), axis=0), axis=0)
+            ratio = ratio - rank * margin
+        return cast(Array, ratio)
 
     def _scores(self, signals: Signals) -> tuple[Array, Array]:
         """Return the two scores v (sensors, N) and l (…, N)."""
@@ -154,3 +154,10 @@ class PricedThreshold(BeliefRule):
             return signals["variance_reduction"], signals["silent_variance"]
         beliefs = self.beliefs(signals)
         return beliefs.value, beliefs.loss
+
+
+def _log(values: Array) -> Array:
+    """Return ln of values >= 0, finite at 0."""
+    xp = namespace(values)
+    result: Array = xp.log(xp.maximum(values, 1e-300))
+    return result

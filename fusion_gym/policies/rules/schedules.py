@@ -1,12 +1,13 @@
 """Rules that use the clock, the order of grants, or covariances, and no measurement."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.core.knowledge import Knowledge, Signals
+from fusion_gym.namespace import namespace
 from fusion_gym.policies.base import (
     ChanceRule,
     PerSensor,
@@ -214,7 +215,8 @@ class Paced(Rule):
         phase = np.full((sensors, 1), _ROUNDING)
         if self.staggered:
             phase += np.arange(sensors)[:, None] / sensors
-        return np.floor((step + 1) * rate + phase) > np.floor(step * rate + phase)
+        floor = namespace(step, rate).floor
+        return cast(Requests, floor((step + 1) * rate + phase) > floor(step * rate + phase))
 
 
 @dataclass
@@ -334,7 +336,9 @@ class VarianceThreshold(Rule):
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         reduction = signals["variance_reduction"]
-        due = np.broadcast_to(signals["silent_variance"] >= self.threshold, reduction.shape)
+        due = namespace(reduction).broadcast_to(
+            signals["silent_variance"] >= self.threshold, reduction.shape
+        )
         return strongest(reduction, due, self.at_most, signals["age"])
 
 
