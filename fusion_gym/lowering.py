@@ -51,10 +51,9 @@ COMPARISONS: dict[str, tuple[str, str, Any]] = {
 }
 # Functions of real numbers, of LLVM or of the C library.
 _SAME = (
-    *("exp", "exp2", "log", "log1p", "expm1", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
-    *("asin", "asinh", "acos", "atan", "atan2", "erf", "erfc", "pow"),
+    "exp exp2 log log1p expm1 sin cos tan sinh cosh tanh asin asinh acos atan atan2 erf erfc pow"
 )
-FUNCTIONS = {name: name for name in _SAME}
+FUNCTIONS = {name: name for name in _SAME.split()}
 FUNCTIONS |= {name: f"llvm.{name}" for name in ("sqrt", "floor", "ceil")}
 # Other functions of numbers: of the program, the type, the parameters and the numbers.
 NUMBERS: dict[str, Callable[..., Any]] = {

@@ -101,19 +101,6 @@ class MemoryColumns(NamedTuple):
         return result
 
 
-class DerivedBeliefs:
-    """Beliefs whose attributes are a function of their names, each computed on first access."""
-
-    def __init__(self, attribute: Callable[[str], Any]) -> None:
-        self._attribute = attribute
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        vars(self)[name] = value = self._attribute(name)
-        return value
-
-
 @dataclass(frozen=True)
 class Estimate:
     """A mean (k, n, N) and a covariance (k, n, n, N), with k = 1 or one estimate per sensor.

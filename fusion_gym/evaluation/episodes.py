@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import DerivedBeliefs, Owner
+from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signals
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
@@ -355,9 +355,22 @@ def _part(whole: Signals, runs: Runs) -> Signals:
 
 def _take(whole: Signals, name: str, runs: Runs) -> Any:
     value: Any = whole[name]
-    if name in ("beliefs", "own_beliefs"):
-        return DerivedBeliefs(lambda attribute: take_runs(getattr(value, attribute), runs))
+    if isinstance(value, Beliefs):
+        return _Part(value, runs)
     if name == "token_cost":  # the same for all runs
         return value
     # The observation has the batch first.
     return value[runs] if name == "observation" else take_runs(value, runs)
+
+
+class _Part:
+    """The beliefs of some runs; each attribute is computed on first access."""
+
+    def __init__(self, whole: Beliefs, runs: Runs) -> None:
+        self._whole, self._runs = whole, runs
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        vars(self)[name] = value = take_runs(getattr(self._whole, name), self._runs)
+        return value

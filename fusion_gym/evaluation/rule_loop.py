@@ -60,10 +60,10 @@ class RuleLoop:
         requests = np.zeros((task.sensors, 1), np.bool_)
         self._template: Any = self._step.template, values, requests, np.zeros((2, 1))
         arrays = arrays_of(self._template)
-        self.width = sum(array.size for array in arrays)
+        self._width = sum(array.size for array in arrays)
         own = (field.name for field in dataclasses.fields(rule) if field.name != "task")
         others = {name: getattr(rule, name) for name in own if name not in sizes}
-        key, row = (task, type(rule), others, self.sizes), Buffer(_REAL, arrays, self.width)
+        key, row = (task, type(rule), others, self.sizes), Buffer(_REAL, arrays, self._width)
         step, limit = self._step, np.zeros(1, np.int64)
         inputs: Any = step.start_noise, step.noise, np.zeros(1), limit, *values
         sources = [Buffer(array.dtype, [array]) for array in inputs]
@@ -86,7 +86,7 @@ class RuleLoop:
             part = slice(first, first + _TOGETHER)
             some, price = places[part], np.ascontiguousarray(prices[part], _REAL)
             normals, runs = noise.take(some, axis=-1), len(some)
-            rows, limit = np.empty((2, runs, self.width)), np.full(runs, horizon)
+            rows, limit = np.empty((2, runs, self._width)), np.full(runs, horizon)
             own = [np.ascontiguousarray(values[field][:, part], _REAL) for field in self.sizes]
             inputs = starts.take(some, axis=-1), normals[0], price, limit, *own
             before, after = (row.ctypes.data for row in rows)
