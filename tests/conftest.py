@@ -9,6 +9,8 @@ import pytest
 # Two test processes share two cores: more threads would only wait for each other. NumPy and torch
 # read this when they are imported, which is later, and so do the commands that tests start.
 os.environ["OMP_NUM_THREADS"] = "1"
+# XLA's optimization takes longer than the steps of a test.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 
 @pytest.fixture

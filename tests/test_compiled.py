@@ -152,7 +152,7 @@ def test_damaged_code_is_compiled_again(cache: Path) -> None:
     task = fusion_gym.make_task(LINEAR, backend="compiled")
     expected = rewards(task)
     files = sorted(cache.iterdir())
-    assert len(files) == 2  # a start and a step
+    assert len(files) == 4  # the code of a start and of a step, and their tasks
     for file in files:
         file.write_bytes(file.read_bytes()[:-9])
     compiled._LOADED.clear()
@@ -185,7 +185,7 @@ def test_other_numbers_have_other_code(cache: Path) -> None:
     ]
     assert (every[0] != every[1]).any()
     np.testing.assert_array_equal(every[0], every[2])
-    assert len([*cache.iterdir()]) == 4
+    assert len([*cache.iterdir()]) == 8
 
 
 @pytest.mark.parametrize(

@@ -160,35 +160,48 @@ def compile_function(
 
 
 def _machine_code(task: Any, source: Callable[[], str]) -> int:
-    """Return the address of code from this process, from the cache, or compiled of its assembly."""
-    key = _fingerprint(task)
-    if key in _LOADED:
-        return _LOADED[key][1]
-    code = None if key is None else _read(key)
-    if key is None or code is None:
+    """Return the address of code from this process, from the cache, or compiled of its assembly.
+
+    The cache has the code of an assembly, and the hash of a task's assembly.
+    """
+    name = _fingerprint(task)
+    if name in _LOADED:
+        return _LOADED[name][1]
+    stored = name and _read(name)
+    key = stored.decode() if stored else ""
+    code = key and _read(key)
+    if not code:
         text = source()
-        key = key or hashlib.sha256(f"{_surroundings()}{text}".encode()).hexdigest()
+        key = hashlib.sha256(f"{_surroundings()}{text}".encode()).hexdigest()
         code = _read(key) or _compile(text)
-        with contextlib.suppress(OSError):
-            _FOLDER.mkdir(parents=True, exist_ok=True)
-            part = _FOLDER / f"{key}.{os.getpid()}"
-            part.write_bytes(hashlib.sha256(code).digest() + code)
-            part.replace(_FOLDER / key)
+        _write(key, code)
+        if name:
+            _write(name, key.encode())
     if key not in _LOADED:
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(jit=True))
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         _LOADED[key] = engine, engine.get_function_address("step")
+    _LOADED[name or key] = _LOADED[key]
     return _LOADED[key][1]
 
 
 def _read(key: str) -> bytes | None:
-    """Return the whole code of a file, or ``None``."""
+    """Return the whole content of a file, or ``None``."""
     with contextlib.suppress(OSError):
         content = (_FOLDER / key).read_bytes()
         if hashlib.sha256(content[32:]).digest() == content[:32]:
             return content[32:]
     return None
+
+
+def _write(key: str, content: bytes) -> None:
+    """Store the content of a file, with its hash, where the folder can be written."""
+    with contextlib.suppress(OSError):
+        _FOLDER.mkdir(parents=True, exist_ok=True)
+        part = _FOLDER / f"{key}.{os.getpid()}"
+        part.write_bytes(hashlib.sha256(content).digest() + content)
+        part.replace(_FOLDER / key)
 
 
 def _compile(text: str) -> bytes:
@@ -212,12 +225,16 @@ def _machine(jit: bool = False) -> Any:
 
 @functools.cache
 def _surroundings() -> str:
-    """Return what the code depends on besides the task: versions, sources and processor."""
-    files = sorted(_PACKAGE.rglob("*.py"))
-    sources = [(str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files]
+    """Return what the code of an assembly depends on: libraries and processor."""
     libraries = [version(name) for name in ("numpy", "llvmlite")]
-    processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    return repr((sources, libraries, processor))
+    return repr((libraries, llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()))
+
+
+@functools.cache
+def _sources() -> bytes:
+    """Return what the assembly of a task depends on: the content of the package's files."""
+    files = sorted(_PACKAGE.rglob("*.py"))
+    return b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
 
 
 class _Parts(pickle.Pickler):
@@ -249,4 +266,4 @@ def _fingerprint(task: Any) -> str | None:
         for name in pickler.modules
     ):
         return None
-    return hashlib.sha256(_surroundings().encode() + file.getvalue()).hexdigest()
+    return hashlib.sha256(_surroundings().encode() + _sources() + file.getvalue()).hexdigest()

@@ -263,15 +263,15 @@ def test_the_functional_environment_assigns() -> None:
 
     env, _ = make(NAME, **ASSIGNED)
     assert env.num_actions == 2
-    _, state = env.reset(jax.random.key(0))
-    noise = np.zeros((env._channels, 1))
+    _, state = jax.jit(env.reset)(jax.random.key(0))
+    noise, step = np.zeros((env._channels, 1)), jax.jit(env.step_env)
     for action in itertools.product(range(4), repeat=2):
-        outcome = env.step_env(noise, state, np.array(action))[2]
+        outcome = step(noise, state, np.array(action))[2]
         expected = channel_requests(np.array(action)[:, None], 3)
         np.testing.assert_array_equal(outcome.granted, expected > 0)
     keys = jax.random.split(jax.random.key(1), 3)
-    _, states = jax.vmap(env.reset)(keys)
-    *_, info = jax.vmap(env.step)(keys, states, np.array([[1, 2], [3, 3], [0, 0]]))
+    _, states = jax.jit(jax.vmap(env.reset))(keys)
+    *_, info = jax.jit(jax.vmap(env.step))(keys, states, np.array([[1, 2], [3, 3], [0, 0]]))
     np.testing.assert_array_equal(info["granted"], [[1, 1, 0], [0, 0, 1], [0, 0, 0]])
 
 
