@@ -5,10 +5,10 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 LOWEST := .venv-lowest
 # A part of the tests that touches every dependency.
-QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_environment_api.py \
-	tests/test_evaluation.py tests/test_model_files.py \
-	tests/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
-	tests/test_benchmark.py::test_from_prices_to_pages_and_zoo
+QUICK  := tests/laws/test_interfaces.py tests/core/test_bad_input.py tests/envs/test_environment_api.py \
+	tests/evaluation/test_evaluation.py tests/policies/test_model_files.py \
+	tests/training/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
+	tests/benchmark/test_benchmark.py::test_from_prices_to_pages_and_zoo
 
 .PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers papers-check zoo newcomer pages docs integrations \
 	integrations-tianshou integrations-rejax integrations-rllib lines lint format bench clean
@@ -57,15 +57,14 @@ test-lowest: $(LOWEST)/.installed  ## quick tests with the lowest versions that 
 	$(LOWEST)/bin/python -m pytest -m "not slow" -n 2 $(QUICK)
 
 wheel-test: $(STAMP)  ## the package outside the repository, and every block of README and docs with it
-	$(BIN)/python tests/wheel_smoke.py
-	OMP_NUM_THREADS=1 $(BIN)/python tests/wheel_blocks.py
+	OMP_NUM_THREADS=1 PYTHONPATH=tests/helpers $(BIN)/python tests/repository/wheel_smoke.py
 
 wheel: $(STAMP)  ## build the wheel into dist/
 	$(BIN)/python -m build --wheel
 
 coverage: $(STAMP)  ## what the journeys reach: files by share, functions in runs/coverage/function_index.html
 	rm -rf runs/coverage && mkdir -p runs/coverage
-	cd runs/coverage && export PATH="$(CURDIR)/$(BIN):$$PATH" && for journey in $(CURDIR)/tests/journeys/*.py; do \
+	cd runs/coverage && export PATH="$(CURDIR)/$(BIN):$$PATH" && for journey in $(CURDIR)/tests/journeys/scripts/*.py; do \
 		coverage run --append --source=$(CURDIR)/fusion_gym,$(CURDIR)/agents $$journey || exit; done && \
 		coverage report --sort=cover && coverage html --directory=.
 
@@ -122,7 +121,7 @@ newcomer: $(STAMP)  ## run the commands of docs/newcomer.md and write its tables
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.newcomer
 
 lines:  ## code lines without blanks, comments and docstrings
-	@$(PYTHON) tests/lines.py
+	@$(PYTHON) tests/repository/lines.py
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .
@@ -144,7 +143,7 @@ pages: $(STAMP)  ## tables and the picture of networks in docs/, from the code
 
 docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links and length of its prose checked
 	$(BIN)/python -m docs.tables --check
-	$(BIN)/python tests/prose.py
+	$(BIN)/python tests/repository/prose.py
 	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -c docs -d runs/docs/doctrees . site/html
 	echo '<meta http-equiv="refresh" content="0; url=html/docs/index.html">' > site/index.html
 

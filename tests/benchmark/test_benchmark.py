@@ -1,0 +1,292 @@
+"""The benchmark: prices, searched rules, agents, verdict, pages and the zoo made from it."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import yaml
+from benchmark_rows import read_rows
+from command_runs import refusal, succeed
+from paths import ROOT
+from scipy import stats
+
+import fusion_gym
+from agents.benchmark import evidence, rules, settings, verdict
+from agents.benchmark.report import draw_class, headline_text, mean_text
+from agents.benchmark.settings import CLASSES, knowledge_of, load_suite
+from agents.benchmark.verdict import cost_difference, discoveries, mean_difference
+from fusion_gym.core.knowledge import covers
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.rule_search import ThresholdTrial
+from fusion_gym.policies.registry import make_policy
+
+SMALL = {
+    "episodes": 20,
+    "tuning_episodes": [4, 4],
+    "calibration_episodes": [2, 4],
+    "case_episodes": 4,
+    "generations": 2,
+    "training_seeds": [2, 2],
+    "steps": 0.001,
+    "cases": [{"name": "half the tokens", "tokens": 0.5}],
+    "rules": [
+        {"policy": "paced:rate={value}", "ends": [0.01, 1]},
+        {"policy": "value_of_information:threshold={value}", "ends": [0.01, 60]},
+        {"policy": "value_of_information:own=true,threshold={value}", "ends": [0.01, 60]},
+    ],
+}
+
+
+@pytest.fixture
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The words of a benchmark of one small setting."""
+    content = yaml.safe_load(settings.FILE.read_text()) | SMALL
+    (setting,) = (item for item in content["settings"] if item["name"] == "remote_estimation")
+    setting |= {"cases": [], "num_envs": 8}
+    content["comparison"]["steps"] = {"remote_estimation": 2.0}
+    setting["options"] |= {"horizon": 12}
+    content["settings"] = [setting]
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(content))
+    monkeypatch.setattr(settings, "FILE", tmp_path / "settings.yaml")
+    places = ["--work", str(tmp_path / "work"), "--results", str(tmp_path / "results")]
+    return [*places, "--workers", "1"]
+
+
+def test_from_prices_to_pages_and_zoo(
+    small: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    printed = succeed("benchmark", small).out
+    folder = tmp_path / "results"
+    policies = read_rows(folder, evidence.TestRow)
+    for name in CLASSES:
+        for kind, seeds in (("rule", 1), ("threshold", 1), ("agent", 2), ("learned", 2)):
+            own = [row for row in policies if (row.name, row.kind) == (name, kind)]
+            assert len(own) == 5 * seeds
+            prices = [row.price for row in own[:5]]
+            assert prices == sorted(set(prices))
+            for row in own:
+                assert row.cost == pytest.approx(row.error + row.price * row.tokens, rel=1e-4)
+    for kind in ("optimum", "other", "other_learned"):
+        assert {row.name for row in policies if row.kind == kind} == {"scheduler"}
+    means = read_rows(folder, evidence.ClassRow)
+    points = read_rows(folder, evidence.PointRow)
+    for mean in means:
+        key = (mean.name, mean.kind)
+        own_points = [point.difference for point in points if (point.name, point.kind) == key]
+        assert mean.difference == pytest.approx(np.mean(own_points), abs=1e-4)
+    trainings = read_rows(folder, evidence.TrainingRow)
+    assert [row.algorithm for row in trainings] == ["counterfactual_ppo"] * 6 + ["ppo"] * 2
+    for row in trainings:
+        kind = "learned" if row.algorithm == "counterfactual_ppo" else "other_learned"
+        own = [p for p in policies if (p.name, p.kind, p.seed) == (row.name, kind, row.seed)]
+        rule = [p.cost for p in policies if (p.name, p.kind) == (row.name, "rule")]
+        ratios = np.divide([p.cost for p in own], rule)
+        assert row.learned == pytest.approx(ratios.mean() - 1.0, abs=1e-4)
+        # Where the calibration takes the rule alone, both policies are the same.
+        assert 0 <= row.rule_points <= np.isclose(ratios, 1.0, atol=1e-5).sum()
+    savings = {row.kind: row for row in read_rows(folder, evidence.SavingRow)}
+    costs = {
+        (kind, name): np.array([p.cost for p in policies if (p.kind, p.name) == (kind, name)])
+        for kind in ("rule", "trigger")
+        for name in CLASSES
+    }
+    shares = [1.0 - costs["rule", name] / costs["trigger", name] for name in ("local", "scheduler")]
+    assert savings["rule"].saving == pytest.approx(np.mean(shares), abs=1e-4)
+    assert savings["rule"].classes == 2
+    cases = read_rows(folder, evidence.CaseRow)
+    assert [row.case for row in cases] == ["as assumed", "half the tokens"]
+    assert cases[0].rule == 0.0
+    page = (folder / "README.md").read_text()
+    assert headline_text(load_suite().settings, list(savings.values())) in page
+    assert (folder / "remote_estimation.png").stat().st_size > 20_000
+    assert "remote_estimation" in printed
+    # Finished pieces are not done again.
+    monkeypatch.setattr("agents.benchmark.jobs.Call", pytest.fail)
+    succeed("benchmark", small)
+    assert (folder / "README.md").read_text() == page
+    place = ["--work", str(tmp_path / "work"), "--zoo", str(tmp_path / "zoo"), "--workers", "1"]
+    succeed("zoo", place)
+    card = json.loads((tmp_path / "zoo" / "remote_estimation_local.json").read_text())
+    rows = [row for row in policies if (row.name, row.kind) == ("local", "learned")]
+    costs = {f"{row.cost:.4g}" for row in rows}
+    assert {f"{point['cost']:.4g}" for point in card["test"]["points"]} <= costs
+
+
+def test_the_suite_of_channels_tests_each_rule_and_agents_that_assign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = yaml.safe_load(settings.FILE.with_stem("channels").read_text())
+    for setting in content["settings"]:
+        setting["options"] |= {"horizon": 12}
+        setting |= {"num_envs": 8, "cases": setting.get("cases", [])[:1]}
+    small = {name: value for name, value in SMALL.items() if name not in ("rules", "cases")}
+    (tmp_path / "channels.yaml").write_text(yaml.safe_dump(content | small | {"steps": 1e-4}))
+    monkeypatch.setattr(settings, "FILE", tmp_path / "settings.yaml")
+    monkeypatch.chdir(tmp_path)
+    succeed("benchmark", ["--suite", "channels", "--workers", "1"])
+    folder = tmp_path / "results" / "channels"
+    rows, page = read_rows(folder, evidence.TestRow), (folder / "README.md").read_text()
+    for setting in content["settings"]:
+        costs = {
+            kind: [row.cost for row in rows if (row.setting, row.kind) == (setting["name"], kind)]
+            for kind in ("trigger", *setting["named_rules"], "agent", "learned", "other")
+        }
+        assert {kind: len(own) for kind, own in costs.items()} == {
+            kind: 5 * (2 if kind in ("agent", "learned", "other") else 1) for kind in costs
+        }
+        assert (costs["agent"] == costs["learned"]) == (setting["name"] == "many_plants")
+        assert all(
+            re.search(rf"\| {setting['title']} +\| {kind} +\|", page)
+            for kind in setting["named_rules"]
+        )
+    assert "](../../docs/benchmark.md)" in page
+    assert {row.name for row in rows} == {"centre", "scheduler"}
+    algorithms = {row.algorithm for row in read_rows(folder, evidence.TrainingRow)}
+    assert algorithms == {"counterfactual_ppo", "maskable_ppo"}
+
+
+def test_a_policy_of_ones_own_has_the_same_verdict(small: list[str]) -> None:
+    text = "value_of_information:price={price}"
+    printed = succeed("benchmark", [*small, "--policy", text, "--class", "scheduler"]).out
+    assert "policy" in printed
+    error = refusal("benchmark", [*small, "--policy", text, "--class", "centre"])
+    assert "it declares knowledge = 'scheduler', and the class has 'centre'" in error
+    assert "class = None is not allowed" in refusal("benchmark", [*small, "--policy", text])
+
+
+def test_the_make_target_is_a_command() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    _, words = makefile.split("python -m agents.benchmark", 1)
+    error = refusal("benchmark", [*words.splitlines()[0].split(), "--settings", "nowhere"])
+    assert "settings = 'nowhere' is not allowed" in error
+
+
+def test_one_seed_has_the_interval_of_students_test() -> None:
+    generator = np.random.default_rng(0)
+    reference = generator.gamma(2.0, size=50)
+    cost = reference + generator.normal(0.1, 0.3, 50)
+    result = cost_difference([cost], reference)
+    test = stats.ttest_1samp((cost - reference) / reference.mean(), 0.0)
+    interval = test.confidence_interval(0.95)
+    assert result.p == pytest.approx(test.pvalue)
+    assert (result.low, result.high) == pytest.approx((interval.low, interval.high))
+
+
+def results_of(costs: Any) -> list[verdict.TestResult]:
+    """The results of a policy with these costs of episodes, at one price."""
+    return [verdict.TestResult("policy", 1.0, np.asarray(costs), np.zeros(len(costs)), 0.0, 0.0)]
+
+
+@pytest.mark.parametrize("seeds", [[3], [5, 3, 3]])
+def test_intervals_over_seeds_and_episodes_cover_the_mean(seeds: list[int]) -> None:
+    """Of crossed effects of seeds and 100 episodes, in one or three classes: at least 93 in 100."""
+    generator = np.random.default_rng(1)
+    covered = 0
+    for _ in range(1000):
+        episodes, pairs = generator.normal(0.0, 0.2, 100), []
+        for count in seeds:
+            noise = generator.normal(0.0, 0.1, (count, 100))
+            costs = 1.0 + generator.normal(0.0, 0.02, (count, 1)) + episodes + noise
+            pairs.append(([results_of(own) for own in costs], results_of(np.ones(100))))
+        result = mean_difference(pairs)
+        covered += result.low <= 0.0 <= result.high
+    assert covered >= 930
+
+
+def test_a_mean_over_classes_weighs_classes_and_not_seeds() -> None:
+    reference = results_of([1.0, 3.0])
+    pairs = [([results_of([2.0, 4.0])] * 5, reference), ([results_of([1.0, 3.0])] * 3, reference)]
+    assert mean_difference(pairs).mean == pytest.approx(0.25)
+
+
+def test_a_median_stands_beside_a_mean_that_an_outlier_moves() -> None:
+    assert mean_text(evidence.ClassRow("a", "b", "c", 0.1, 0.05, 0.15, 0.01)) == (
+        "+10.0 ± 5.0 (median +1.0)"
+    )
+    assert mean_text(evidence.ClassRow("a", "b", "c", -0.1, -0.12, -0.08, -0.105)) == "−10.0 ± 2.0"
+    assert mean_text(evidence.ClassRow("a", "b", "bound", -0.1, -0.1, -0.1, -0.1)) == "−10.0"
+
+
+def test_points_without_tokens_have_a_tick_and_no_line() -> None:
+    rows = [
+        evidence.TestRow("a", "local", "trigger", 0, 0.1, price, 1.0, error, tokens, 0.0, 0.0, "")
+        for price, error, tokens in ((0.1, 0.2, 2.0), (1.0, 0.5, 0.02), (9.0, 0.9, 0.0))
+    ]
+    _, panel = plt.subplots()
+    assert list(draw_class(panel, rows)) == ["own trigger"]
+    line, alone, _ = panel.get_lines()
+    assert sorted(line.get_xdata()) == [0.02, 2.0]
+    assert (list(alone.get_ydata()), alone.get_linestyle()) == ([0.9], "None")
+    ticks = dict(zip(panel.get_xticks(), panel.get_xticklabels(), strict=True))
+    assert ticks[alone.get_xdata()[0]].get_text() == "0"
+    assert {"0.1", "1"} <= {label.get_text() for label in ticks.values()}
+    assert len(panel.get_yticks()) >= 3
+    plt.close()
+
+
+def test_discoveries_are_those_of_the_procedure() -> None:
+    assert discoveries([0.001, 0.02, 0.04, 0.9]) == [True, True, False, False]
+    assert discoveries([0.04, 0.04]) == [True, True]
+    assert discoveries([]) == []
+
+
+def test_prices_are_slopes_of_the_front(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where error = 1 / tokens, the best at price p spends p^(-1/2)."""
+    trials = [
+        ThresholdTrial(f"x:y={value}", value, value, 1.0 / value)
+        for value in np.geomspace(0.01, 1.0, 200).tolist()
+    ]
+    always = type("Brief", (), {"tokens": np.ones(3)})
+    monkeypatch.setattr(rules, "run_episodes", lambda *_: always)
+    monkeypatch.setattr(rules, "make_policy", lambda *_: None)
+    shares = (0.5, 0.25, 0.12, 0.06, 0.03)
+    job = rules.SweepJob(load_suite().settings[0], "scheduler", (), shares, (3, 3))
+    task: Any = None
+    prices = rules._prices(task, trials, job)
+    assert prices == pytest.approx([share**-2 for share in shares], rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "count"), [("settings", 8), ("channels", 2)])
+def test_all_tasks_and_rules_of_the_benchmark_exist(
+    name: Any, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite, tasks, make = load_suite(name=name), {}, settings.Setting.task
+
+    def task_once(setting: Any, name: Any, case: Any = None) -> Any:
+        key = setting.name, setting.has_memory(name), case and case.name
+        tasks[key] = tasks.get(key) or make(setting, name, case)
+        return tasks[key]
+
+    monkeypatch.setattr(settings.Setting, "task", task_once)
+    assert len(suite.settings) == count
+    for setting in suite.settings:
+        for name in setting.classes:
+            own = rules.rules_of(setting, name, suite.rules)
+            assert len(own) >= 4
+            for rule in own:
+                task = setting.task(name, case=rule.case)
+                policy = make_policy(rule.policy.format(value=rule.ends[1]), task)
+                assert covers(knowledge_of(setting, name), policy.knowledge)
+            for case in (None, *suite.cases_of(setting)):
+                options = setting.agent_environment(name, (0.01, 1.0), case)
+                fusion_gym.make_task(setting.environment, **options)
+    assert [item.name for item in load_suite(quick=True).settings][-1] == "remote_estimation"
+
+
+@pytest.mark.parametrize("name", fusion_gym.zoo.names())
+def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
+    """The card's first 60 episodes at its middle price, to what their mean allows."""
+    card = fusion_gym.zoo.card(name)
+    centre = {"information": "centre"} if card["class"] == "centre" else {}
+    task = fusion_gym.make_task(card["env"], **(card["options"] | centre))
+    place = len(card["test"]["prices"]) // 2
+    policy = make_policy(f"zoo:{name},price={card['test']['prices'][place]!r}", task)
+    results = run_episodes(task, policy, 60, card["test"]["seed"])
+    point = card["test"]["points"][place]
+    deviation = results.mse.std() / np.sqrt(60)
+    assert results.mse.mean() == pytest.approx(point["mse"], abs=4.5 * deviation)
+    assert results.rate.mean() == pytest.approx(point["rate"], abs=0.03)

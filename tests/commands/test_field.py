@@ -1,0 +1,305 @@
+"""fusion-gym field: from a log to the settings of devices."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from command_runs import call, refusal, succeed
+
+import fusion_gym
+from fusion_gym.commands import field
+from fusion_gym.commands.field import AGENT, Field
+from fusion_gym.evaluation import field_study, run_episodes
+from fusion_gym.evaluation.devices import fields_of, longest_interval, step_of
+from fusion_gym.evaluation.field_study import (
+    METHODS,
+    PRACTICE,
+    FieldStudy,
+    MethodPoint,
+    compare_with_practice,
+    measure,
+    point_of,
+)
+from fusion_gym.recordings import Recording, fit
+from fusion_gym.systems.tobit.recorded import WindowNoise
+from fusion_gym.validation import ConfigurationError
+
+STUDY = FieldStudy({}, rate=0.05, shape=(1.0, 1.0), horizon=50, source="normal")
+
+
+def point(factor: float, error: float, spread: float = 0.0, windows: int = 40) -> MethodPoint:
+    """A point at a multiple of the target rate, with errors that vary between windows."""
+    draw = np.random.default_rng(0).normal(size=windows)
+    draw = spread * (draw - draw.mean())
+    rates = [[0.05 * factor] * 2] * windows
+    return MethodPoint([1.0], error, (error * (1.0 + draw)).tolist(), rates, [1.0, 1.0])
+
+
+def test_methods_are_compared_at_equal_packets_and_at_equal_error() -> None:
+    """Errors that are powers of the rate: closed forms."""
+    factors = (0.5, 0.7, 1.0, 1.4, 2.0)
+    points = {
+        PRACTICE: [point(f, 0.4 / f) for f in factors],
+        "silence used": [point(1.3 * f, 0.1 / (1.3 * f)) for f in factors],
+        "centralised": [point(f, 0.3 / f, 0.2) for f in factors],
+    }
+    results = {result.name: result for result in compare_with_practice(STUDY, points)}
+    assert results["silence used"].relative.mean == pytest.approx(-0.75, abs=1e-9)
+    assert results["silence used"].relative.high == pytest.approx(-0.75, abs=1e-9)
+    assert results["silence used"].packets == pytest.approx(0.25, abs=1e-6)
+    assert results["centralised"].relative.low < -0.25 < results["centralised"].relative.high
+    assert results[PRACTICE].packets == pytest.approx(1.0)
+    assert results[PRACTICE].ratio == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_the_interval_is_that_of_blocks_of_five_windows(level: float) -> None:
+    """Errors that cancel within a block have none; errors of whole blocks have that of 16."""
+    turns = np.tile([2.0, -1.0, -1.0, 1.0, -1.0], 16)
+    blocks = np.repeat(np.resize([1.0, -1.0], 16), 5)
+    errors = (1.0 + 0.1 * (level * blocks + (1.0 - level) * turns)).tolist()
+    rates = [[0.05, 0.05]] * 80
+    points = {
+        PRACTICE: [MethodPoint([1.0], 1.0, [1.0] * 80, rates, [1.0, 1.0])],
+        "centralised": [MethodPoint([1.0], 1.0, errors, rates, [1.0, 1.0])],
+    }
+    points = {name: own * 2 for name, own in points.items()}
+    relative = compare_with_practice(STUDY, points)[1].relative
+    expected = level * 1.96 * 0.1 / np.sqrt(16)
+    assert relative.mean == pytest.approx(0.0, abs=1e-12)
+    assert relative.high - relative.mean == pytest.approx(expected, rel=0.1, abs=1e-12)
+    assert relative.mean - relative.low == pytest.approx(expected, rel=0.1, abs=1e-12)
+
+
+def test_errors_are_means_of_the_steps_with_readings() -> None:
+    """Half the readings of the second sensor are absent, and their errors count as zero."""
+    known = np.zeros((8, 2))
+    known[::2, 1] = np.nan
+    rows = np.hstack([np.zeros((8, 2)), known])
+    noise = WindowNoise(np.zeros((2, 7)), rows, np.array([0, 4]), 2)
+    study: Any = SimpleNamespace(
+        task=lambda *names: SimpleNamespace(noise=noise),
+        shape=(1.0, 1.0), options={"state_weights": [0.5, 0.125, 0.0]},
+    )  # fmt: skip
+    squared = np.array([[1.0, 2.0, 7.0], [3.0, 6.0, 7.0]])  # of two windows
+    cost = squared @ study.options["state_weights"]
+    real: Any = SimpleNamespace(squared_error=squared, error_cost=cost, rate=np.zeros((2, 2)))
+    result = point_of(study, [1.0], SimpleNamespace(error_cost=np.ones(3)), real)  # type: ignore[arg-type]
+    assert result.deviations == pytest.approx(np.sqrt([2.0, 4.0 / 0.5]))
+    assert np.mean(result.errors) == pytest.approx(0.5 * 2.0 + 0.125 * 4.0 / 0.5)
+    assert result.errors[1] == pytest.approx(3.0 * result.errors[0])
+
+
+def test_a_study_ends_in_the_settings_of_devices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = {"_TRIALS": 2, "_EPISODES": 4, "_CLOSE": 0.5, "FACTORS": (0.5, 1.0, 2.0), "RESAMPLES": 20}
+    for name, value in few.items():
+        monkeypatch.setattr(field_study, name, value)
+    monkeypatch.setattr(field, "_WINDOWS", 150)  # of 20 steps
+    folder = tmp_path / "field"
+    words = ["tanks", "--exact", "--output", str(folder), "--timesteps", "2000", "--workers", "1"]
+    printed = succeed("field", words).out
+    settings = yaml.safe_load((folder / "devices.yaml").read_text())
+    assert list(settings) == ["inflow", "middle", "outflow"]
+    assert all(row["min_interval"] == 60.0 for row in settings.values())
+    assert all(row["max_interval"] == 12_000.0 for row in settings.values())
+    assert all(0.1 < row["reportable_change"] < 30.0 for row in settings.values())
+    report = (folder / "report.md").read_text()
+    for text in (*METHODS, AGENT, "packets a day", "`devices.yaml`", "![Error over packets]"):
+        assert text in report
+    assert printed.strip() in report
+    assert "<table>" in (folder / "report.html").read_text()
+    assert {path.name for path in folder.glob("*.png")} == {"card.png", "curves.png"}
+    code = report.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(folder)
+    exec(code, {})
+    assert "already holds a study" in refusal("field", words)
+    assert "target_rate = 0.1 differs" in refusal("field", [*words, "--target-rate=.1", "--resume"])
+    (folder / "silence_used.json").unlink()
+    before = json.loads((folder / "practice.json").read_text())
+    again = succeed("field", [*words, "--resume"]).out
+    assert again == printed
+    assert json.loads((folder / "practice.json").read_text()) == before
+
+
+ROOM = ["--exact", "--share", "0.6", "--workers", "1", "--timesteps", "10"]
+
+
+@pytest.fixture
+def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The words of a short study of a room, whose agent is the centralised rule."""
+    few = {"_TRIALS": 2, "_EPISODES": 4, "_CLOSE": 0.3, "FACTORS": (0.5, 1.0, 2.0), "RESAMPLES": 20}
+    for name, value in few.items():
+        monkeypatch.setattr(field_study, name, value)
+    monkeypatch.setattr(field, "train_agent", lambda study, *_: measure(study, "centralised"))
+    draw, path = np.random.default_rng(0).normal(size=(2400, 2)), np.zeros((2400, 2))
+    for row in range(1, 2400):
+        path[row] = 0.95 * path[row - 1] + draw[row] * [0.4, 2.0]
+    index = pd.date_range("2026-01-01", periods=2400, freq="10min", name="time")
+    table = pd.DataFrame(
+        path + np.array([20.0, 50.0]), index=index, columns=["air [°C]", "damp [%]"]
+    )
+    table.to_csv(tmp_path / "room.csv", float_format="%.2f")
+    return [str(tmp_path / "room.csv"), "--output", str(tmp_path / "field"), *ROOM]
+
+
+def test_the_least_packets_keep_the_tolerance_with_what_a_device_holds(
+    room: list[str], tmp_path: Path
+) -> None:
+    """The written settings, replayed by themselves; thresholds a third larger exceed it."""
+    words = [*room, "--tolerance", "air=0.3", "damp=1.5", "--device", "zigbee"]
+    printed = succeed("field", words).out
+    settings = yaml.safe_load((tmp_path / "field" / "devices.yaml").read_text())
+    assert [row["reportable_change"] * 100 for row in settings.values()] == pytest.approx(
+        [row["zigbee"]["reportable_change"] for row in settings.values()]
+    )
+    assert all(isinstance(row["zigbee"]["reportable_change"], int) for row in settings.values())
+    intervals = {row["zigbee"]["maximum_reporting_interval"] for row in settings.values()}
+    assert max(intervals) == max(row["max_interval"] for row in settings.values()) <= 65_534
+    for text in ("Temperature Measurement 0x0402", "Zigbee Cluster Library"):
+        assert text in printed
+    thresholds = np.array([row["reportable_change"] for row in settings.values()])
+    code = printed.split("make_task(")[1].split(")")[0]
+    plant = yaml.safe_load((tmp_path / "field" / "plant.yaml").read_text())
+    options = {"log": room[0], "tokens": "unlimited", "fit_share": 0.6, "horizon": 20} | plant
+    steps, excess = max(intervals) // 600, []
+    for factor in (1.0, 1.35):
+        own = (factor * thresholds).tolist()
+        silence = {"filter": "truncated", "trigger": "report_on_change", "trigger_threshold": own}
+        silence = silence if "truncated" in code else {"filter": "hold"}
+        task = fusion_gym.make_task(field_study.ENV, **options | silence)
+        rule = f"report_on_change:reportable_change={own[0]}/{own[1]},max_interval={steps}"
+        noise: Any = task.noise
+        results = run_episodes(task, fusion_gym.make_policy(rule, task), noise.count, 0)
+        excess.append(np.max(np.sqrt(results.squared_error.mean(0)) / [0.3, 1.5]))
+        day = results.rate.mean(0) * 144
+        if factor == 1.0:
+            assert all(f"| {value:.1f} " in printed for value in day)
+    assert excess[0] <= 1.0 < excess[1]
+
+
+def test_a_tolerance_that_no_setting_keeps_is_said(room: list[str]) -> None:
+    """A step of 1 hPa is too large."""
+    log = Path(room[0])
+    log.write_text(log.read_text().replace("damp [%]", "damp [hPa]"))
+    printed = succeed("field", [*room, "--tolerance", "0.01", "--device", "zigbee"]).out
+    assert "**No setting keeps the tolerance**" in printed
+
+
+def test_an_interrupted_study_continues_within_a_method(
+    room: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+    original = field_study.run_episodes
+
+    def interrupted(*words: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 30:
+            raise KeyboardInterrupt
+        return original(*words)
+
+    monkeypatch.setattr(field_study, "run_episodes", interrupted)
+    ended = call("field", room)
+    assert ended.status == 130
+    assert "--resume" in ended.err
+    first = succeed("field", [*room, "--resume"]).out
+    resumed = len(calls)
+    calls[:] = [1] * 100
+    assert succeed("field", [*room, "--output", f"{room[2]} again"]).out == first
+    assert resumed == len(calls) - 100 + 1  # the interrupted simulation runs twice
+
+
+@pytest.mark.slow
+def test_a_log_on_change_with_a_date_format_is_studied(room: list[str], tmp_path: Path) -> None:
+    """The plant is the plant of the held readings, and a refused study leaves no folder."""
+    table = pd.read_csv(room[0], index_col=0, parse_dates=True)
+    sent, last = np.ones(table.shape, bool), table.iloc[0].to_numpy()
+    for row, values in enumerate(table.to_numpy()[1:], 1):
+        sent[row] = np.abs(values - last) >= [0.4, 2.0]
+        last = np.where(sent[row], values, last)
+    held = table.where(sent)
+    held.index = held.index.strftime("%d.%m.%Y %Hh%M")
+    output, form = tmp_path / "field", ["--date-format", "%d.%m.%Y %Hh%M"]
+    for rows, words, message in (
+        (2400, form, "give --on-change"),
+        (2400, ["--on-change"], "(--date-format)"),
+        (300, [*form, "--on-change", "--share", "0.95"], "horizon = 20"),
+    ):
+        held[:rows].to_csv(room[0])
+        assert message in refusal("field", [*room, *words])
+        assert not output.exists()
+    held.to_csv(room[0])
+    ended = succeed("field", [*room, *form, "--on-change"])
+    assert "warning: " in ended.err
+    assert "steps of silence have the last reading" in ended.err
+    assert set(yaml.safe_load((output / "devices.yaml").read_text())) == {"air", "damp"}
+    whole = Recording.read(output / "log.csv")
+    assert np.array_equal(whole.values, table.where(sent).ffill())
+    plant = fit(whole.select(["air", "damp"]), 0.6, exact=True, order=1)
+    made = yaml.safe_load((output / "plant.yaml").read_text())
+    assert np.allclose(made["transition"], plant.transition)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--tolerance", "1", "2"], "one number, or one for each of the channels inflow, middle"),
+        (["--tolerance", "inflow=1", "middle=1", "outlet=1"], "of the channels inflow, middle"),
+        (["--tolerance", "0"], "tolerance = 0 is not allowed: it must be a finite number > 0"),
+        (["--tolerance", "1", "--target-rate", ".1"], "--tolerance determines the rate"),
+        (["--tolerance", "warm"], "tolerance = 'warm'"),
+    ],
+)
+def test_what_is_no_tolerance_is_refused(words: list[str], message: str, tmp_path: Path) -> None:
+    output = tmp_path / "field"
+    assert message in refusal("field", ["tanks", "--exact", *words, "--output", str(output)])
+    assert not output.exists()
+
+
+def test_fields_of_devices() -> None:
+    """By the Zigbee Cluster Library, BACnet's SubscribeCOV and ESPHome's filters."""
+    assert longest_interval("zigbee", 600.0) == 109
+    assert longest_interval("bacnet", 600.0) > 7_000_000
+    with pytest.raises(ConfigurationError, match=r"device = 'zigbee' .* interval of 86400 s"):
+        longest_interval("zigbee", 86_400.0)
+    study = replace(STUDY, steps=(step_of("zigbee", "°C"), step_of("zigbee", "hPa")))
+    assert study.quantize(np.array([0.2549, 0.2])).tolist() == [0.25, 1.0]
+    assert study.quantize(np.array([1e6, 1e6])).tolist() == [327.67, 32_767.0]
+    assert STUDY.quantize(np.array([0.00123456, 98765.0])).tolist() == [0.001235, 98_760.0]
+    assert fields_of("zigbee", "°C", 0.25, 60.0, 6000.0) == {
+        "cluster": "Temperature Measurement 0x0402", "reportable_change": 25,
+        "minimum_reporting_interval": 60, "maximum_reporting_interval": 6000,
+    }  # fmt: skip
+    unknown = fields_of("zigbee", "m/s", 3.0, 600.0, 60_000.0)
+    assert unknown["reportable_change"] == "3 in unknown steps"
+    assert fields_of("bacnet", "°C", 0.25, 60.0, 6000.0) == {
+        "COV_Increment": 0.25, "lifetime": 6000,
+    }  # fmt: skip
+    filters = fields_of("esphome", "°C", 0.25, 60.0, 6000.0)["filters"]
+    assert filters == [{"throttle": "60s"}, {"or": [{"heartbeat": "6000s"}, {"delta": 0.25}]}]
+
+
+def test_a_channel_with_noise_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    draw = np.random.default_rng(0)
+    lines = ["time,a"]
+    level = 0.0
+    for step in range(3000):
+        level = 0.95 * level + draw.normal()
+        lines.append(f"{60 * step + 1_700_000_000},{level + 2.0 * draw.normal():.3f}")
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    output = tmp_path / "field"
+    error = refusal("field", [str(tmp_path / "log.csv"), "--output", str(output)])
+    assert "give --exact if they are" in error
+    assert not output.exists()
+
+
+def test_an_interrupt_says_how_to_continue() -> None:
+    command = Field("log.csv")
+    assert command.again().endswith("--resume")

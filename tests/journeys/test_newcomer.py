@@ -1,0 +1,119 @@
+"""From an empty folder to a front: the page's own lines run, with less of everything."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_runs import refusal, succeed
+from paths import ROOT
+
+from benchmarks.newcomer import replaced, run
+from fusion_gym.commands.compare import Compare
+from fusion_gym.envs.registration import make_task
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.validation import ConfigurationError
+
+PAGE = (ROOT / "docs" / "newcomer.md").read_text()
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+LESS = {
+    "evaluate": ["--episodes", "3"],
+    "train": ["--timesteps", "2048", "--set", "horizon=8"],
+    "compare": ["--episodes", "3"],
+}
+
+
+def command_lines() -> list[list[str]]:
+    text = "".join(block for language, block in BLOCKS if language == "bash")
+    return [shlex.split(line) for line in text.replace("\\\n", " ").splitlines()]
+
+
+def test_the_lines_of_the_page_lead_to_a_front(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text, _ = (block for language, block in BLOCKS if language == "yaml")
+    first, *_ = text.splitlines()
+    Path(first.removeprefix("# ")).write_text(text)
+    installing, *commands = command_lines()
+    assert installing[:2] == ["pip", "install"]
+    assert [words[1] for words in commands] == [*LESS, "train", "compare"]
+    for program, name, *words in commands[: len(LESS)]:
+        assert program == "fusion-gym"
+        ended = succeed(name, [*words, *LESS[name]])
+        if name == "evaluate":
+            assert "kitchen" in ended.out
+    assert (tmp_path / "runs/rooms/comparison/pareto.png").stat().st_size > 20_000
+    points = json.loads((tmp_path / "runs/rooms/comparison/comparison.json").read_text())["points"]
+    prices = [float(point["policy"].partition("price=")[2]) for point in points]
+    # The plant of the file belongs to the training, wherever the file has gone.
+    content = yaml.safe_load((tmp_path / "runs/rooms/front/config.yaml").read_text())["environment"]
+    options = content["options"]
+    assert options.pop("reward_scale") > 0.0
+    low, high = options.pop("price_range")
+    np.testing.assert_allclose(prices, np.geomspace(low, high, 7), rtol=1e-3)
+    assert (prices[0], prices[-1]) == (low, high)
+    assert options == {
+        "memory": True, "cost_weight": "random", "horizon": 8, **yaml.safe_load(text)
+    }  # fmt: skip
+    Path("rooms.yaml").write_text(text.replace("0.05", "0.04"))
+    same = ["--config", "linear_fusion_front", "--output", "runs/rooms/front", "--set", "horizon=8"]
+    error = refusal("train", [*same, "system=rooms.yaml", "--resume", "--timesteps", "4096"])
+    assert "environment" in error
+    assert "transition" in error
+
+
+def front(**options: Any) -> Any:
+    experiment = load_checked(Experiment, "linear_fusion_front").changed(None, options)
+    return make_task(experiment.environment.id, **experiment.environment.options)
+
+
+def requests_at(policy: str, prices: int | None) -> Compare:
+    return Compare(config="a", sweep="b", policy=policy, output=Path("c"), prices=prices)
+
+
+def test_prices_are_for_agents_that_see_one() -> None:
+    task = front(price_range=[0.01, 1.0])
+    assert list(requests_at("always", None).policies_of(task).values()) == pytest.approx([0.1])
+    assert requests_at("model:a.zip", 3).policies_of(task) == {
+        "model:a.zip,price=0.01": 0.01, "model:a.zip,price=0.1": 0.1, "model:a.zip,price=1.0": 1.0
+    }  # fmt: skip
+    narrow = front(price_range=[0.0123456789, 0.2])
+    assert min(requests_at("zoo:x", 2).policies_of(narrow)) == "zoo:x,price=0.0123456789"
+    with pytest.raises(ConfigurationError, match=r"prices = 3 .* takes no price"):
+        requests_at("always", 3).policies_of(task)
+    with pytest.raises(ConfigurationError, match=r"prices = 3 .* no price_range"):
+        requests_at("model:a.zip", 3).policies_of(make_task("fusion_gym/LinearFusion-v2"))
+
+
+def test_tables_go_between_their_marks() -> None:
+    text = "a\n<!-- table: x -->\nold\n<!-- end -->\n<!-- table: y -->\n<!-- end -->\n"
+    once = replaced(text, "x", "| new |")
+    assert once == replaced(once, "x", "| new |")
+    assert "old" not in once
+    assert once.endswith("<!-- table: y -->\n<!-- end -->\n")
+
+
+def test_a_command_that_has_ended_is_not_run_again(tmp_path: Path) -> None:
+    first = run("python -c 'print(1)'", tmp_path)
+    assert run("python -c 'print(1)'", tmp_path) == first
+    with pytest.raises(RuntimeError, match="ended with 3"):
+        run("python -c 'raise SystemExit(3)'", tmp_path)
+
+
+def test_many_sensors_train_shorter() -> None:
+    experiment = load_checked(Experiment, "linear_fusion_front")
+    lengths = [
+        experiment.resolved({"reward_scale": 1.0, "price_range": None}, sensors).training.timesteps
+        for sensors in (2, 4, 12)
+    ]
+    assert lengths == [800_000, 800_000, 266_667]
+    given = experiment.changed(None, timesteps=1000)
+    assert given.resolved(given.environment.options | {"reward_scale": 1.0}, 12).training == (
+        given.training
+    )

@@ -1,0 +1,122 @@
+"""Every reproduced paper's page against a fresh quick run: numbers, claims and figures.
+
+The fresh run has few episodes and another seed. Each of its numbers must lie within 4.5 standard
+errors of the committed one, both samples together. The standard error of an episode's mean is that
+of the committed sample, from its 95 % interval: the fresh one is too small to tell its own.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_runs import call
+from matplotlib.text import Text
+from paths import ROOT
+
+from agents.papers.numbers import UNDECIDED
+from agents.papers.page import draw_figure, render_page
+from agents.papers.paper import NAMES, Data, Paper, load_paper
+from agents.papers.reproduce import reproduce_figure
+from fusion_gym.output import palette
+from fusion_gym.policies.settings import parse_settings
+
+PAGES = ROOT / "docs" / "reproduction"
+ERRORS = 4.5  # of both samples together
+SLACK = 1e-9  # what else a number may be off, relative to its size (or absolute below 1)
+SEED = 1_000_000
+PNG, SVG = 100_000, 200_000  # bytes of a figure
+
+
+def quick(paper: Paper, episodes: int) -> tuple[dict[str, Any], dict[str, Data]]:
+    """The numbers of the page of a fresh run, and its data, read as the command does it."""
+    results: dict[str, dict[str, Data]] = {}
+    for reading, changes in paper.readings.items():
+        results[reading] = data = {}
+        for piece in paper.pieces:
+            result = piece.simulate(episodes, SEED, paper.settings(changes))
+            plain = {name: value for name, value in result.items() if not hasattr(value, "dtype")}
+            data[piece.name] = result | json.loads(json.dumps(plain))
+    counts = {piece.name: {"episodes": episodes, "seed": SEED} for piece in paper.pieces}
+    return render_page(paper, results, counts)[1], results[next(iter(paper.readings))]
+
+
+def check_numbers(page: dict[str, Any], fresh: dict[str, Any], episodes: int) -> None:
+    """Hold every number to the committed one."""
+    far = []
+    for table, others in zip(page["tables"], fresh["tables"], strict=True):
+        assert (table["piece"], table["name"]) == (others["piece"], others["name"])
+        ratio = page["made"][table["piece"]]["episodes"] / episodes
+        for old, new in zip(table["numbers"], others["numbers"], strict=True):
+            assert (new["what"], new["printed"]) == (old["what"], old["printed"])
+            deviation = (old["high"] - old["low"]) / 3.92 * math.sqrt(1.0 + ratio)
+            allowed = ERRORS * deviation + SLACK * max(1.0, abs(old["mean"]))
+            if not abs(new["mean"] - old["mean"]) <= allowed:
+                far.append(f"{old['what']}: {new['mean']:.6g}, not {old['mean']:.6g} ± {allowed}")
+    assert not far, "\n".join(far)
+
+
+def check_claims(page: dict[str, Any], fresh: dict[str, Any], name: str) -> None:
+    """The same claims; the page's verdicts are the JSON's, and a fresh run's unless undecided."""
+    text = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+    differing = []
+    for old, new in zip(page["claims"], fresh["claims"], strict=True):
+        assert new["text"] == old["text"]
+        beginning = f"| {old['text']} | {old['source']} | ".replace("\\", "")
+        assert f"{beginning}**{old['verdict']}**" in text.replace("\\|", "|"), old["text"]
+        if UNDECIDED not in (old["verdict"], new["verdict"]) and new["verdict"] != old["verdict"]:
+            differing.append(f"{old['text']}: {new['verdict']}, not {old['verdict']}")
+    assert not differing, "\n".join(differing)
+
+
+def check_pictures(paper: Paper, data: dict[str, Data]) -> None:
+    """Every figure draws, and its files are there and small."""
+    for figure in paper.figures.values():
+        drawing = draw_figure(figure, data[figure.piece])
+        drawing.draw_without_rendering()
+        assert drawing.axes
+        palette.plt.close(drawing)
+    for suffix, most in (("png", PNG), ("svg", SVG)):
+        there = {p.stem: p.stat().st_size for p in (PAGES / paper.name).glob(f"*.{suffix}")}
+        assert set(there) == set(paper.figures)
+        assert max(there.values()) <= most, there
+
+
+EPISODES = {
+    "tobit_token_bucket": 40, "adaptive_innovation": 12, "markov_jump": 30, "unknown_input": 24,
+    "round_robin_tobit": 24,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_page_is_that_of_a_fresh_run(name: str) -> None:
+    episodes = EPISODES[name]
+    paper, page = load_paper(name), json.loads((PAGES / f"{name}.json").read_text(encoding="utf-8"))
+    fresh, data = quick(paper, episodes)
+    check_numbers(page, fresh, episodes)
+    check_claims(page, fresh, name)
+    check_pictures(paper, data)
+
+
+@pytest.mark.parametrize(
+    ("name", "figure", "changes", "label"),
+    [
+        ("markov_jump", "5", {"m": "0.7", "policies": "random:rate=0.3"}, "m = 0.7"),
+        ("adaptive_innovation", "7", {"scales": "0.5,0.9"}, "(b) 0.9 of bounds"),
+        ("round_robin_tobit", "table_2", {"interval": "2,1"}, "[-1, 1]"),
+        ("round_robin_tobit", "5", {"policy": "round_robin:period=2"}, "RMSE1 (of x1)"),
+    ],
+)
+def test_a_figure_has_parameters(
+    name: str, figure: str, changes: dict[str, str], label: str, tmp_path: Path
+) -> None:
+    texts = [f"{key}={value}" for key, value in changes.items()]
+    if figure == "table_2":  # a table is the fastest
+        words = [name, "--figure", figure, "--episodes", "2", "--set", *texts, "--workers", "1"]
+        ended = call("papers", [*words, "--output", str(tmp_path), "--work", str(tmp_path)])
+        assert ended.status == 0, ended.err
+        assert {path.suffix for path in tmp_path.rglob("*_*.*")} >= {".png", ".svg"}
+    drawing = reproduce_figure(name, figure, 2, **parse_settings("option", texts))
+    assert label in {text.get_text() for text in drawing.findobj(Text)}
+    palette.plt.close(drawing)

@@ -1,0 +1,299 @@
+"""Plants fitted to logs of known plants, and their criticism."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from command_runs import refusal, succeed
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.recordings import FittedPlant, RecordedChannel, Recording, criticise, fit
+from fusion_gym.recordings.fitting import (
+    RATES,
+    RATIOS,
+    deviations,
+    noisy_channels,
+    residual_correlations,
+    warnings_of,
+)
+from fusion_gym.validation import ConfigurationError
+
+A = np.array([[0.92, 0.05, 0.0], [0.04, 0.9, 0.05], [0.0, 0.06, 0.93]])
+W = np.array([[1.0, 0.2, 0.0], [0.2, 0.8, 0.1], [0.0, 0.1, 0.5]])
+
+
+def simulate(rows: int, seed: int = 0, second: NDArray[np.float64] | None = None) -> np.ndarray:
+    """A path of the tanks' plant; ``second`` is the coefficient of the second lag."""
+    noise = np.random.default_rng(seed).multivariate_normal(np.zeros(3), W, rows)
+    path = np.zeros((rows, 3))
+    for row in range(2, rows):
+        path[row] = A @ path[row - 1] + noise[row]
+        path[row] += 0.0 if second is None else second @ path[row - 2]
+    return path
+
+
+def recording(values: np.ndarray, every: str = "1min") -> Recording:
+    index = pd.date_range("2026-01-01", periods=len(values), freq=every)
+    names = [f"c{place}" for place in range(values.shape[1])]
+    return Recording(
+        pd.DataFrame(values, index=index, columns=names), tuple(map(RecordedChannel, names))
+    )
+
+
+def test_least_squares_finds_the_plant_within_its_intervals() -> None:
+    path = simulate(40_000)
+    plant = fit(recording(path), exact=True)
+    assert plant.order == 1
+    rows = 20_000
+    spread = np.linalg.inv(plant.stationary_covariance).diagonal()
+    error = np.sqrt(np.outer(W.diagonal(), spread) / rows)
+    assert np.all(np.abs(plant.transition - A) < 4.0 * error)
+    deviation = np.sqrt((np.outer(W.diagonal(), W.diagonal()) + W**2) / rows)
+    assert np.all(np.abs(plant.process_covariance - W) < 4.0 * deviation)
+
+
+def test_likelihood_finds_the_plant_despite_gaps_and_two_rates() -> None:
+    path = simulate(6000)
+    path[np.random.default_rng(1).random(path.shape) < 0.1] = np.nan
+    path[np.arange(6000) % 4 > 0, 2] = np.nan
+    plant = fit(recording(path), exact=True)
+    deviation = np.sqrt((np.outer(W.diagonal(), W.diagonal()) + W**2) / 3000)
+    deviation[2], deviation[:, 2] = 3.0 * deviation[2], 3.0 * deviation[:, 2]  # a quarter is seen
+    assert np.all(np.abs(plant.process_covariance - W) < 4.0 * deviation)
+    assert np.abs(plant.transition - A).max() < 0.06
+
+
+def test_likelihood_is_least_squares_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to the degrees of freedom: 299 steps and three coefficients a channel."""
+    own = recording(simulate(600))
+    squares = fit(own, exact=True, order=1)
+    monkeypatch.setattr("fusion_gym.recordings.fitting._is_complete", lambda values: False)
+    likelihood = fit(own, exact=True, order=1)
+    assert likelihood.transition == pytest.approx(squares.transition, abs=1e-7)
+    expected = squares.process_covariance * (299 - 3) / 299
+    assert likelihood.process_covariance == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_criticism_of_white_noise_has_a_closed_form() -> None:
+    """What is not sent has its whole error; two sensors take turns, each in every fourth step."""
+    variance, step = np.array([4.0, 9.0]), np.arange(200)
+    values = np.random.default_rng(0).normal(size=(200, 2)) * np.sqrt(variance)
+    values[7, 1] = np.nan
+    plant = FittedPlant(("a", "b"), np.zeros((2, 2)), np.diag(variance), np.full(2, 1e-9), 1)
+    silent = np.stack([step % 4 != 0, step % 4 != 2], axis=1)
+    squares = values**2 / variance
+    always, fourth = criticise(plant, values, (1.0, 0.25))
+    assert (always.real, always.model, always.nees) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert fourth.real == pytest.approx(np.nansum(squares * silent) / 399)
+    assert fourth.model == pytest.approx(299 / 399)
+    assert fourth.nees == pytest.approx(np.nansum(squares * silent) / 299)
+
+
+def test_an_honest_plant_has_nees_of_one_and_no_warning() -> None:
+    own = recording(simulate(40_000))
+    plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
+    criticism = criticise(plant, values[rows:])
+    assert [row.rate for row in criticism] == list(RATES)
+    assert all(0.95 <= row.nees <= 1.05 for row in criticism), criticism
+    assert all(0.95 <= row.ratio <= 1.05 for row in criticism), criticism
+    assert not warnings_of(plant, values[rows:], criticism)
+
+
+def test_doubled_noise_in_the_second_half_gets_a_warning() -> None:
+    path = simulate(20_000)
+    path[10_000:] *= 2.0
+    own = recording(path)
+    plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
+    criticism = criticise(plant, values[rows:])
+    assert len(warnings_of(plant, values[rows:], criticism)) >= len(RATES)
+    assert all(3.5 < row.ratio < 4.5 for row in criticism)
+
+
+def test_a_second_lag_is_fitted_where_it_helps() -> None:
+    second = -0.5 * np.eye(3)
+    assert fit(recording(simulate(20_000, second=second)), exact=True).order == 2
+    plant = fit(recording(simulate(20_000, second=second)), exact=True)
+    assert plant.transition[:3, 3:] == pytest.approx(second, abs=0.05)
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", **plant.options)
+    assert task.plant.state_names[3:] == ("c0_lag1", "c1_lag1", "c2_lag1")
+    assert not task.reward.state_weights[3:].any()
+
+
+def test_the_order_is_chosen_on_rows_that_were_not_fitted() -> None:
+    """The second lag ends with the fitted two thirds, and is of no use after them."""
+    draw, path = np.random.default_rng(0).normal(size=2400), np.zeros((2400, 1))
+    for row in range(2, 2400):
+        lags = (1.2, -0.6) if row < 800 else (0.75, 0.0)
+        path[row] = lags @ path[[row - 1, row - 2]] + draw[row]
+    assert fit(recording(path), exact=True).order == 1
+
+
+def test_an_explosive_fit_is_damped_and_has_the_residuals_of_its_regression() -> None:
+    """Least squares by definition: W with n - k degrees of freedom, all poles times one factor."""
+    path = 1.02 ** np.arange(800)[:, None] + np.random.default_rng(0).normal(size=(800, 1))
+    plant = fit(recording(path), exact=True, order=2)
+    values = deviations(recording(path), 0.5)[0][:400, 0]
+    lags = np.stack([values[1:-1], values[:-2]], axis=1)
+    coefficients, squares, *_ = np.linalg.lstsq(lags, values[2:])
+    assert plant.process_covariance[0, 0] == pytest.approx(float(squares[0]) / (398 - 2), rel=1e-9)
+    poles = np.sort_complex(np.roots([1.0, *-coefficients]))
+    assert np.abs(poles).max() > 1.001
+    damped = np.sort_complex(np.linalg.eigvals(plant.transition))
+    assert damped == pytest.approx(poles * 0.9999 / np.abs(poles).max(), rel=1e-9)
+
+
+def test_changes_and_weights_have_a_closed_form() -> None:
+    """Two channels x' = a x + w: a change in ten steps has variance 2 P (1 - a^10)."""
+    a, variance = np.array([0.9, 0.5]), np.array([4.0, 9.0])
+    plant = FittedPlant(
+        ("a", "b"), np.diag(a), np.diag(variance * (1.0 - a**2)), np.full(2, 1e-6), 1
+    )
+    assert plant.typical_changes == pytest.approx(np.sqrt(2.0 * variance * (1.0 - a**10)))
+    assert plant.options["state_weights"] == pytest.approx(1.0 / variance / 2.0)
+
+
+def test_residuals_of_too_few_lags_are_not_white() -> None:
+    own = recording(simulate(20_000, second=-0.5 * np.eye(3)))
+    values, rows = deviations(own, 0.5)
+    plant = FittedPlant(("a", "b", "c"), A, W, np.full(3, 1e-6), 1)
+    assert max(value for _, _, value in residual_correlations(plant, values[rows:])) > 0.3
+    assert any("not white" in line for line in warnings_of(plant, values[rows:], []))
+    white = recording(simulate(20_000)).values.to_numpy()
+    assert max(value for _, _, value in residual_correlations(plant, white)) < 0.05
+
+
+def test_residuals_are_those_of_readings_only() -> None:
+    """Steps without a reading change no correlation of a plant without memory."""
+    plant = FittedPlant(("a", "b"), np.zeros((2, 2)), np.eye(2), np.full(2, 1e-9), 1)
+    values = np.random.default_rng(0).normal(size=(100, 2)).cumsum(0)
+    gaps = np.full((200, 2), np.nan)
+    gaps[::2] = values
+    both = (residual_correlations(plant, path) for path in (values, gaps))
+    for (name, lag, value), row in zip(*both, strict=True):
+        assert row == (name, lag, pytest.approx(value))
+        assert value > 0.8
+
+
+def test_a_daily_cycle_is_removed() -> None:
+    path = simulate(6000)
+    cycle = np.cos(2.0 * np.pi * np.arange(6000) / 144)[:, None]
+    own = recording(path + 30.0 * cycle + 100.0, "10min")
+    values, _ = deviations(own, 0.5)
+    assert np.abs(cycle[:, 0] @ values / 3000).max() < 1.5  # of 30
+    short = recording(path[:600] + 30.0 * cycle[:600], "10min")
+    assert np.abs(cycle[:600, 0] @ deviations(short, 0.5)[0] / 300).min() > 20.0
+
+
+def test_a_channel_with_measurement_noise_is_named() -> None:
+    path = simulate(6000)
+    path[:, 1] += np.random.default_rng(2).normal(0.0, 1.5, 6000)
+    plant = fit(recording(path))
+    assert noisy_channels(plant) == ["c1"]
+    assert plant.measurement_variance[1] == pytest.approx(2.25, rel=0.2)
+
+
+def test_a_random_walk_becomes_a_stable_plant() -> None:
+    plant = fit(recording(np.random.default_rng(3).normal(size=(4000, 2)).cumsum(0)), exact=True)
+    assert np.abs(np.linalg.eigvals(plant.transition)).max() < 1.0
+
+
+@pytest.mark.parametrize(("rows", "share"), [(100, 0.5), (4000, 0.02)])
+def test_too_few_readings_are_refused(rows: int, share: float) -> None:
+    with pytest.raises(
+        ConfigurationError, match=r"readings of c0 in the fitted part = .* must be .* >= 200"
+    ):
+        fit(recording(simulate(rows)), share)
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1, 0.96])
+def test_a_share_beyond_the_log_is_refused(share: float) -> None:
+    with pytest.raises(ConfigurationError, match=f"share = {share} is not allowed"):
+        fit(recording(simulate(1000)), share)
+
+
+def test_a_channel_that_does_not_change_in_the_fitted_part_is_refused() -> None:
+    path = simulate(1000)
+    path[:500, 1] = 101.3
+    with pytest.raises(ConfigurationError, match=r"channels = 'c1' .* change in the fitted part"):
+        fit(recording(path))
+
+
+@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("gaps", [0.0, 0.2])
+def test_a_plant_is_the_same_in_every_unit(exact: bool, gaps: float) -> None:
+    path = simulate(2400).round(1)
+    path[np.random.default_rng(1).random(path.shape) < gaps] = np.nan
+    expected = fit(recording(path), exact=exact)
+    for unit in (1e-9, 1e-6, 1e3, 1.8, np.array([1e-9, 1.0, 1e3])):
+        sizes = np.tile(np.broadcast_to(unit, 3), expected.order)
+        plant = fit(recording(path * unit), exact=exact)
+        transition = plant.transition / np.divide.outer(sizes, sizes)
+        assert transition == pytest.approx(expected.transition, rel=1e-6, abs=1e-9)
+        process = plant.process_covariance / np.outer(sizes, sizes)
+        assert process == pytest.approx(expected.process_covariance, rel=1e-6, abs=1e-9)
+        noise = plant.measurement_variance / sizes[:3] ** 2
+        assert noise == pytest.approx(expected.measurement_variance, rel=1e-6)
+    micro = fit(recording(path * 1e-6), exact=exact).options
+    fusion_gym.make_task("fusion_gym/LinearFusion-v2", **micro)
+    with pytest.raises(ConfigurationError, match=r"deviation of c0 = .* >= 1e-07"):
+        _ = fit(recording(path * 1e-9), exact=exact).options
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_channel_may_be_silent_for_long(exact: bool) -> None:
+    """Silent in the last 3,100 rows of the fitted part: the rows before have its coefficients."""
+    path = simulate(8000)
+    path[900:4000, 1] = np.nan
+    plant = fit(recording(path), exact=exact, order=1)
+    assert plant.transition == pytest.approx(A, abs=0.08)
+    path[150:4000, 1] = np.nan
+    with pytest.raises(ConfigurationError, match="readings of c1 in the fitted part = 150 "):
+        fit(recording(path), exact=exact)
+
+
+def test_exact_readings_in_coarse_steps_have_no_noise() -> None:
+    """Two thirds of neighbouring readings are equal, as of rooms in steps of 0.1."""
+    path = np.round(0.05 * simulate(8000)[:, :1] + 21.0, 1)
+    assert (np.diff(path, axis=0) == 0.0).mean() > 0.5
+    plant = fit(recording(path), exact=True)
+    assert plant.measurement_variance == pytest.approx(1e-10 * path[:4000].var(), rel=1e-9)
+    assert noisy_channels(plant) == []
+
+
+def test_an_alarm_that_begins_late_is_fitted() -> None:
+    path = np.c_[simulate(4000)[:, :2], np.arange(4000) > 1990]
+    assert np.isfinite(fit(recording(path), exact=True).transition).all()
+
+
+@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("weights", [(0.0, 1.0), (1.0, 1.0)])
+def test_channels_that_determine_each_other_are_refused(
+    weights: tuple[float, float], exact: bool
+) -> None:
+    path = simulate(2000)[:, :2]
+    with pytest.raises(ConfigurationError, match="do not determine each other"):
+        fit(recording(np.c_[path, path @ weights]), exact=exact)
+
+
+def test_the_mast_has_errors_near_the_models() -> None:
+    own = Recording.read("mast").select()
+    plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
+    criticism = criticise(plant, values[rows:])
+    assert all(RATIOS[0] <= row.ratio <= RATIOS[1] for row in criticism), criticism
+    assert plant.order == 1
+
+
+def test_the_option_file_is_a_plant_of_the_environment(tmp_path: Path) -> None:
+    output = tmp_path / "tanks.yaml"
+    printed = succeed("fit", ["tanks", "--exact", "--output", str(output)])
+    assert "inflow, middle, outflow: order 1, fitted to 3,000 steps" in printed.out
+    assert printed.err.count("warning") == 0, printed.err
+    content = yaml.safe_load(output.read_text())
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", system=str(output))
+    assert task.plant.state_names == ("inflow", "middle", "outflow")
+    assert np.asarray(content["transition"]) == pytest.approx(A, abs=0.04)
+    error = refusal("fit", ["tanks", "--channels", "lake"])
+    assert "channels = 'lake' is not allowed: it must be some of inflow, middle" in error

@@ -1,0 +1,136 @@
+"""Imports run one way, without circles, and packages stay small."""
+
+import ast
+import functools
+import itertools
+from pathlib import Path
+
+import pytest
+from paths import ROOT
+
+from fusion_gym import seeds
+
+# Each package may import from the floors below its own, and from itself.
+FLOORS = {
+    "arrays": 0,
+    "declaration": 0,
+    "docstrings": 0,
+    "entries": 0,
+    "errors": 0,
+    "gaussian": 0,
+    "importing": 0,
+    "linalg": 0,
+    "lowering": 0,
+    "namespace": 0,
+    "option_file": 0,
+    "seeds": 0,
+    "validation": 0,
+    "version": 0,
+    "yaml_text": 0,
+    "fusion": 1,
+    "recordings": 1,
+    "core": 2,
+    "systems": 3,
+    "envs": 4,
+    "solvers": 4,
+    "zoo": 4,
+    "jax": 5,
+    "policies": 5,
+    "evaluation": 6,
+    "configs": 6,
+    "output": 7,
+    "training": 8,
+    "commands": 9,
+}
+
+
+@functools.cache
+def modules() -> dict[str, Path]:
+    """Every module of the library by its dotted name."""
+    files = [*(ROOT / "fusion_gym").rglob("*.py"), *(ROOT / "agents").rglob("*.py")]
+    named = {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in files}
+    return {name.removesuffix(".__init__"): path for name, path in named.items()}
+
+
+@functools.cache
+def imports(module: str) -> frozenset[str]:
+    """The library's modules that a module imports, wherever in its text."""
+    every, result = modules(), set()
+    for node in ast.walk(ast.parse(every[module].read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{module} has a relative import"
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                result.add(inner if inner in every else node.module)
+        elif isinstance(node, ast.Import):
+            result |= {alias.name for alias in node.names}
+    return frozenset(result & every.keys())
+
+
+@functools.cache
+def reached(module: str) -> set[str]:
+    """All that a module imports, directly or not, and itself."""
+    visited: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in visited:
+            visited.add(name)
+            waiting += imports(name)
+    return visited
+
+
+def floor(module: str) -> int | None:
+    parts = module.split(".")
+    if parts[0] == "agents":  # research, made with the library
+        return max(FLOORS.values()) + 1
+    return FLOORS[parts[1]] if len(parts) > 1 else None
+
+
+def package_of(module: str) -> str:
+    first, *rest = module.split(".")
+    return rest[0] if first == "fusion_gym" else first
+
+
+@pytest.mark.parametrize("module", [name for name in modules() if floor(name) is not None])
+def test_imports_run_downwards(module: str) -> None:
+    package, own = package_of(module), floor(module)
+    for other in imports(module):
+        below = floor(other)
+        if package == "agents" and other == "fusion_gym":
+            continue
+        assert below is not None, f"{module} imports the whole package"
+        assert own is not None
+        same = package_of(other) == package or own == below == 0
+        assert same or below < own, f"{module} imports {other}"
+        if package == "systems" and other.startswith("fusion_gym.systems."):
+            families = [name.split(".")[2] for name in (module, other) if name.count(".") > 2]
+            assert len(set(families)) <= 1, f"{module} imports {other} of another family"
+
+
+def test_there_are_no_circles() -> None:
+    for module in modules():
+        for other in imports(module):
+            assert module not in reached(other), f"{module} and {other} import each other"
+
+
+@pytest.mark.parametrize("package", ["core", "fusion", "systems"])
+def test_what_knows_no_environment_imports_no_gymnasium(package: str) -> None:
+    for path in (ROOT / "fusion_gym" / package).rglob("*.py"):
+        text = path.read_text()
+        assert "import gymnasium" not in text, path
+        assert "from gymnasium" not in text, path
+        assert package != "core" or len(text.splitlines()) <= 450, path
+
+
+def test_every_purpose_has_seeds_of_its_own() -> None:
+    """The ranges of seeds are disjoint, and no module writes a seed of one as a literal."""
+    ranges = sorted(
+        (r for r in vars(seeds).values() if isinstance(r, range)), key=lambda r: r.start
+    )
+    assert all(low.stop <= high.start for low, high in itertools.pairwise(ranges))
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and type(node.value) is int:
+                used = [r for r in ranges if r != seeds.TEST and node.value in r[: 10**9]]
+                assert not used or module == "fusion_gym.seeds", (module, node.value)
