@@ -257,13 +257,16 @@ RULES = (
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("TobitOscillator-v1", {"memory": True, "filter": "tobit", "token_rate": 2.0}),
-        ("TobitOscillator-v1", {"memory": True, "broadcast": "estimate", "horizon": 40}),
-        ("BiasedOscillator-v1", {"memory": True, "access": "any"}),
         ("LinearFusion-v2", {}),
         ("RemoteEstimation-v1", {"memory": True, "sensors": 2, "channel": "independent"}),
-        pytest.param(
-            "CorrelatedTracking-v1", {"memory": True, "horizon": 30}, marks=pytest.mark.slow
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("TobitOscillator-v1", {"memory": True, "filter": "tobit", "token_rate": 2.0}),
+                ("TobitOscillator-v1", {"memory": True, "broadcast": "estimate", "horizon": 40}),
+                ("BiasedOscillator-v1", {"memory": True, "access": "any"}),
+                ("CorrelatedTracking-v1", {"memory": True, "horizon": 30}),
+            )
         ),
     ],
 )

@@ -12,7 +12,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from test_namespace import SLOW_TASKS, TASKS
+from test_namespace import MORE_TASKS, TASKS
 
 import fusion_gym
 from fusion_gym.arrays import arrays_of
@@ -24,6 +24,7 @@ from fusion_gym.validation import ConfigurationError
 
 HORIZON, EPISODES = 30, 3
 TOBIT, LINEAR = "fusion_gym/TobitOscillator-v1", "fusion_gym/LinearFusion-v2"
+SMALL = "fusion_gym/RemoteEstimation-v1"  # compiles soonest
 RULES = (
     "innovation_threshold:threshold=1.1",
     "innovation_threshold:threshold=1.1,whitened=true,at_most=1",
@@ -34,14 +35,15 @@ RULES = (
 )
 
 
-def slowly(tasks: Iterable[tuple[Any, ...]]) -> list[Any]:
-    return [pytest.param(*task, marks=pytest.mark.slow) for task in tasks]
+def slowly(tasks: Iterable[tuple[Any, ...]], *quick: str) -> list[Any]:
+    """Cases that are slow, but for those with one of the words."""
+    slow = pytest.mark.slow
+    return [pytest.param(*t, marks=() if any(w in t for w in quick) else slow) for t in tasks]
 
 
-FIRST = list(dict(TASKS).items())  # one of each environment; the last three compile long
-
-
-@pytest.mark.parametrize(("name", "options"), [*FIRST[:-3], *slowly(FIRST[-3:])])
+@pytest.mark.parametrize(
+    ("name", "options"), slowly(dict(TASKS).items(), "LinearFusion-v2", "RemoteEstimation-v1")
+)
 def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(f"fusion_gym/{name}", **options | {"horizon": HORIZON})
     env, parts = FunctionalEnv(task), (task.plant, task.network)
@@ -79,10 +81,10 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("backend", "name", "options"),
     [
-        *(("jax", *task) for task in TASKS),
-        *slowly(("jax", *task) for task in SLOW_TASKS),
+        *slowly((("jax", *task) for task in (*TASKS, *MORE_TASKS)), "RemoteEstimation-v1"),
         *slowly([("jax", "TobitOscillator-v1", {"memory": True})]),
-        *(("compiled", *task) for task in (*TASKS, *SLOW_TASKS)),
+        *slowly((("compiled", *task) for task in TASKS[:-3]), "compiled"),
+        *slowly(("compiled", *task) for task in (*TASKS[-3:], *MORE_TASKS)),
         (
             "compiled",
             "LinearFusion-v2",
@@ -123,7 +125,7 @@ def test_backend_equals_numpy_and_itself_in_any_batch(
                 )
 
 
-@pytest.mark.parametrize("backend", ["jax", "compiled"])
+@pytest.mark.parametrize("backend", [*slowly([("jax",)]), "compiled"])
 def test_interfaces_of_learners_and_rules_run_under_backends(backend: str) -> None:
     options: dict[str, Any] = {"filter": "tobit", "horizon": HORIZON}
     sums = []
@@ -144,7 +146,7 @@ def test_interfaces_of_learners_and_rules_run_under_backends(backend: str) -> No
 
 
 def test_runs_together_are_the_runs_alone() -> None:
-    env, params = fusion_gym.jax.make("fusion_gym/LinearFusion-v2", horizon=4)
+    env, params = fusion_gym.jax.make(SMALL, sensors=2, horizon=4)
     reset, step_alone = jax.jit(env.reset), jax.jit(env.step)
     step_together = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
     keys = jax.random.split(jax.random.key(0), 3)
@@ -192,6 +194,7 @@ def test_an_action_of_another_shape_is_refused() -> None:
             env.step(jax.random.key(1), state, np.array(action), params)
 
 
+@pytest.mark.slow
 def test_parameters_may_be_mapped() -> None:
     env, params = fusion_gym.jax.make(LINEAR)
     key, request, reset = jax.random.key(0), np.array([1, 0]), jax.jit(env.reset)
@@ -244,7 +247,6 @@ def test_what_jax_does_not_run_is_refused(name: str, options: dict[str, Any], fi
         gymnasium.make(f"fusion_gym/{name}", backend="jax", **options)
 
 
-SMALL = "fusion_gym/RemoteEstimation-v1"  # compiles soonest
 ACTION = np.array([1])
 MAKERS: dict[str, Callable[..., Any]] = {
     "single": gymnasium.make,

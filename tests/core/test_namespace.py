@@ -143,9 +143,8 @@ TASKS: list[tuple[str, dict[str, Any]]] = [
     ("CorrelatedTracking-v1", {"noise_scale": "random"}),
     ("MarkovJumpTracking-v1", {}),
     ("UnknownInput-v1", {"filter": "paper", "input_signal": "steps"}),
-]
-# They compile long.
-SLOW_TASKS: list[tuple[str, dict[str, Any]]] = [
+]  # the last three compile long, as do the following
+MORE_TASKS: list[tuple[str, dict[str, Any]]] = [
     ("TobitOscillator-v1", {"filter": "tobit", "fusion": "sici"}),
     *(("MarkovJumpTracking-v1", {"filter": name}) for name in ("centralised", "imm")),
     ("CorrelatedTracking-v1", {"fusion": "ci", "state_weights": (1.0, 2.0, 3.0)}),
@@ -163,6 +162,7 @@ DERIVATIVES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task_options", "parameter"), DERIVATIVES)
 def test_derivatives_equal_central_differences(
     task_options: tuple[str, dict[str, Any]], parameter: str

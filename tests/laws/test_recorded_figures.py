@@ -113,9 +113,11 @@ EVERY = places(NAMED_CASES, "") | places(DRAWN_CASES, "drawn ")
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("key", EVERY)
-def test_figures_are_the_recorded_ones(key: str) -> None:
-    recorded, figures = RECORDED["figures"][key], figures_of(*EVERY[key])
+@pytest.mark.parametrize(("case", "owner"), EVERY.values(), ids=EVERY)
+def test_figures_are_the_recorded_ones(
+    case: Case, owner: Owner | None, request: pytest.FixtureRequest
+) -> None:
+    recorded, figures = RECORDED["figures"][request.node.callspec.id], figures_of(case, owner)
     assert figures.keys() == recorded.keys()
     for name, (total, size) in figures.items():
         assert total == pytest.approx(recorded[name][0], rel=0.0, abs=TOLERANCE * size + 1e-12), (

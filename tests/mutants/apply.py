@@ -1,70 +1,101 @@
-"""Apply each patch of this folder to a copy of the tree: its tests must fail (``make mutants``).
+"""Apply each wrong variant of ``mutants.toml`` to a copy of the tree: its tests must fail.
 
     python tests/mutants/apply.py [NAME …]
 
-A patch begins with one or more lines ``# tests: ARGUMENTS OF PYTEST``, each of which must fail.
+Tests run in forks of this process, which has imported the libraries.
 """
 
+import importlib
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
+import tomllib
+import warnings
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
-FOLDER = Path(__file__).parent
-ROOT = FOLDER.parents[1]
-RED, COLLECTED_NOTHING = 1, 5  # pytest's exit codes
+import pytest
 
-
-def copied(target: Path) -> None:
-    """The tracked files, and new ones that git does not ignore."""
-    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    names = subprocess.run(listed, cwd=ROOT, capture_output=True, check=True).stdout.split(b"\0")
-    there = b"\0".join(name for name in names if name and (ROOT / os.fsdecode(name)).exists())
-    pack = ["tar", "-C", str(ROOT), "--null", "-T", "-", "-cf", "-"]
-    packed = subprocess.run(pack, input=there, capture_output=True, check=True).stdout
-    subprocess.run(["tar", "-C", str(target), "-xf", "-"], input=packed, check=True)
+TABLE = Path(__file__).with_name("mutants.toml")
+ROOT = TABLE.parents[2]
+LIBRARIES = "hypothesis jax matplotlib.pyplot pandas pettingzoo pydantic sb3_contrib scipy.stats"
+VERDICTS = {0: "SURVIVED", 1: "killed", 4: "NO SUCH TEST", 5: "NO SUCH TEST"}  # of pytest's codes
+LIMIT = 300  # seconds of a line of tests
 
 
-def run(patch: Path) -> list[tuple[str, str, float]]:
-    """For each line of tests: what it names, "killed" or what is wrong, and seconds."""
-    text = patch.read_text(encoding="utf-8")
-    lines = [line[9:] for line in text.splitlines() if line.startswith("# tests: ")]
-    with tempfile.TemporaryDirectory() as place:
-        copied(Path(place))
-        applied = subprocess.run(["git", "apply", str(patch)], cwd=place, capture_output=True)
-        if applied.returncode or not lines:
-            return [("", applied.stderr.decode().strip() or "no line of tests", 0.0)]
-        return [(line, *verdict(line, Path(place))) for line in lines]
-
-
-def verdict(line: str, place: Path) -> tuple[str, float]:
-    """What the tests of a line say of the mutant in a folder."""
-    begun = time.monotonic()
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-    changed = {"PYTHONPATH": str(place), "OMP_NUM_THREADS": "1"}
-    ended = subprocess.run(
-        [*command, *shlex.split(line)], cwd=place, env=os.environ | changed, capture_output=True
+def copied(target: str) -> Path:
+    """The tracked files, and new ones that git does not ignore, with the library's bytecode."""
+    script = (
+        "git ls-files -z --cached --others --exclude-standard"
+        f" | tar --null -T - --ignore-failed-read -cf - 2> {os.devnull} | tar -xf - -C {target} && "
+        f"{sys.executable} -m compileall -q --invalidation-mode checked-hash {target}/fusion_gym"
     )
-    text = {0: "SURVIVED", RED: "killed", COLLECTED_NOTHING: "NO SUCH TEST"}
-    return text.get(ended.returncode, "BROKEN"), time.monotonic() - begun
+    subprocess.run(["bash", "-c", script], cwd=ROOT, check=True)
+    return Path(target)
+
+
+def fork(place: Path, tests: list[str]) -> int:
+    """Run tests in a copy of the tree, and return the process, which ends with pytest's code."""
+    with warnings.catch_warnings(action="ignore"):  # JAX has started no threads
+        if child := os.fork():
+            return child
+    signal.alarm(LIMIT)
+    output = os.open(f"{place}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    os.chdir(place)
+    os.environ |= {"PYTHONPATH": str(place), "PYTHONDONTWRITEBYTECODE": "1"}
+    sys.dont_write_bytecode = True
+    sys.path.insert(0, str(place))
+    try:
+        os._exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]))
+    finally:
+        os._exit(3)
+
+
+def run(jobs: Iterable[tuple[Any, str, str, list[str]]]) -> Iterator[tuple[Any, int, str, float]]:
+    """Run jobs (key, file, its changed text, tests); yield key, exit code, output and seconds."""
+    for library in LIBRARIES.split():
+        importlib.import_module(library)
+    left, running = list(jobs)[::-1], {}
+    with tempfile.TemporaryDirectory() as folder:
+        free = [copied(tempfile.mkdtemp(dir=folder)) for _ in range(2)]
+        while left or running:
+            if left and free:
+                (key, name, text, tests), place = left.pop(), free.pop()
+                (place / name).write_text(text, encoding="utf-8")
+                running[fork(place, tests)] = key, name, place, time.monotonic()
+                continue
+            child, status = os.wait()
+            key, name, place, begun = running.pop(child)
+            (place / name).write_bytes((ROOT / name).read_bytes())
+            output = Path(f"{place}.log").read_text(errors="replace")
+            free.append(place)
+            yield key, os.waitstatus_to_exitcode(status), output, time.monotonic() - begun
 
 
 def main(names: list[str]) -> int:
     """Print a row for each line of tests; 1 if a mutant lives or does not apply."""
-    patches = [p for p in sorted(FOLDER.glob("*.patch")) if not names or p.stem in names]
-    missing = set(names) - {patch.stem for patch in patches}
-    if missing:
-        sys.exit(f"error: no patch {sorted(missing)} in {FOLDER}")
-    bad = 0
-    with ThreadPoolExecutor(2) as pool:
-        for patch, rows in zip(patches, pool.map(run, patches), strict=True):
-            for line, text, seconds in rows:
-                bad += text != "killed"
-                print(f"{patch.stem:<38}{text:<14}{seconds:5.0f} s  {line}", flush=True)
+    table = tomllib.loads(TABLE.read_text(encoding="utf-8"))
+    if missing := set(names) - table.keys():
+        sys.exit(f"error: no mutant {sorted(missing)} in {TABLE}")
+    jobs, bad = [], 0
+    for name in names or table:
+        old, mutant = table[name]["old"], table[name]
+        text = (ROOT / mutant["file"]).read_text(encoding="utf-8")
+        if text.count(old) != 1:
+            sys.exit(f"error: the old text of {name} stands {text.count(old)} times in its file")
+        text = text.replace(old, mutant["new"])
+        jobs += [((name, t), mutant["file"], text, shlex.split(t)) for t in mutant["tests"]]
+    for (name, tests), code, _, seconds in run(jobs):
+        verdict = VERDICTS.get(code, "BROKEN")
+        bad += verdict != "killed"
+        print(f"{name:<38}{verdict:<14}{seconds:5.0f} s  {tests}", flush=True)
     return int(bad > 0)
 
 

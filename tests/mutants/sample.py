@@ -8,17 +8,12 @@ The changes are those of mutmut; ``selection.json`` has the tests of each module
 import argparse
 import difflib
 import json
-import os
 import random
-import subprocess
 import sys
-import tempfile
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import libcst
-from apply import copied
+from apply import run
 from libcst.metadata import MetadataWrapper
 from mutmut.mutation.file_mutation import MutationVisitor, deep_replace
 from mutmut.mutation.mutators import mutation_operators
@@ -26,7 +21,6 @@ from mutmut.mutation.pragma_handling import IgnoredCode
 from mutmut.mutation.trampoline_templates import mangle_function_name
 
 SELECTION = Path(__file__).with_name("selection.json")
-SECONDS = 300.0
 
 
 def draw(code: str, count: int, seed: int) -> dict[str, str]:
@@ -48,21 +42,10 @@ def draw(code: str, count: int, seed: int) -> dict[str, str]:
     return {name: deep_replace(module, *nodes[name]).code for name in order[:count]}
 
 
-def killer(module: str, tests: list[str], code: str) -> str:
-    """Return the first failure of the tests in a copy of the tree with this code, if any."""
-    with tempfile.TemporaryDirectory() as folder:
-        copied(Path(folder))
-        (Path(folder) / module).write_text(code)
-        line = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
-        env = os.environ | {"PYTHONPATH": folder, "OMP_NUM_THREADS": "1"}
-        try:
-            done = subprocess.run(
-                line, cwd=folder, env=env, capture_output=True, text=True, timeout=SECONDS
-            )
-        except subprocess.TimeoutExpired:
-            return "timeout"
-    failures = [row for row in done.stdout.splitlines() if row.startswith(("FAILED", "ERROR"))]
-    return "" if done.returncode == 0 else (failures or [f"exit {done.returncode}"])[0]
+def killer(code: int, output: str) -> str:
+    """Return the first failure of the tests of a mutant, if any."""
+    failures = [row for row in output.splitlines() if row.startswith(("FAILED", "ERROR"))]
+    return "" if code == 0 else (failures or [f"exit {code}"])[0]
 
 
 def main() -> None:
@@ -76,21 +59,18 @@ def main() -> None:
     selection = json.loads(SELECTION.read_text())
     resumed = args.resume and args.output.exists()
     results = json.loads(args.output.read_text()) if resumed else {}
+    whole = [((name, ""), name, Path(name).read_text(), tests) for name, tests in selection.items()]
+    for (module, _), code, output, _ in run(whole):
+        if code:
+            sys.exit(f"error: the tests of {module} fail without a mutant: {killer(code, output)}")
     for module, tests in selection.items():
-        code, result = Path(module).read_text(), results.setdefault(module, {})
-        if failure := killer(module, tests, code):
-            sys.exit(f"error: the tests of {module} fail without a mutant: {failure}")
-        mutants = draw(code, args.count // len(selection), args.seed)
-        mutants = {name: text for name, text in mutants.items() if name not in result}
-        with ThreadPoolExecutor(2) as pool:
-            for (name, text), failure in zip(
-                mutants.items(),
-                pool.map(partial(killer, module, tests), mutants.values()),
-                strict=True,
-            ):
-                change = difflib.unified_diff(code.splitlines(), text.splitlines(), n=1)
-                result[name] = {"killer": failure, "diff": "\n".join(change)}
-                args.output.write_text(json.dumps(results, indent=1))
+        text, result = Path(module).read_text(), results.setdefault(module, {})
+        mutants = draw(text, args.count // len(selection), args.seed)
+        jobs = [(n, module, code, tests) for n, code in mutants.items() if n not in result]
+        for name, code, output, _ in run(jobs):
+            change = difflib.unified_diff(text.splitlines(), mutants[name].splitlines(), n=1)
+            result[name] = {"killer": killer(code, output), "diff": "\n".join(change)}
+            args.output.write_text(json.dumps(results, indent=1))
         alive = {name: entry["diff"] for name, entry in result.items() if not entry["killer"]}
         print(f"{module}: {len(result) - len(alive)} of {len(result)} killed", flush=True)
         print("\n".join(alive.values()))
