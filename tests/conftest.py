@@ -1,6 +1,7 @@
 """Settings for all tests."""
 
 import os
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -48,3 +49,24 @@ def registries() -> Iterator[None]:
     for table, before in stored:
         table.clear()
         table.update(before)
+
+
+def aspects(item: Any) -> set[str]:
+    """The values that parameters have in a test, and what a case of laws is a case of."""
+    test, values = item.originalname, item.callspec.params.values()
+    result = {f"{test} {place} {value}" for place, value in enumerate(item.callspec._idlist)}
+    for case in (value for value in values if hasattr(value, "aspects")):
+        result = {aspect for aspect in result if str(case) not in aspect}
+        result |= {f"{test} {part}" if each else part for part, each in case.aspects.items()}
+    return result
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as slow what a product of parameters repeats: quick tests have each value once."""
+    covered: set[str] = set()
+    drawn = [i for i in items if hasattr(i, "callspec") and not i.get_closest_marker("slow")]
+    for item in sorted(drawn, key=lambda item: zlib.crc32(item.nodeid.encode())):
+        if aspects(item) <= covered:
+            item.add_marker(pytest.mark.slow)
+        covered |= aspects(item)

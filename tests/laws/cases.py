@@ -206,6 +206,13 @@ class Case:
         """Whether sensors may have beliefs of their own."""
         return self.local and "delay" not in self.options
 
+    @property
+    def aspects(self) -> dict[str, bool]:
+        """What it is a case of, and whether each law is tested with one."""
+        common = {str(self.options): True} if self.options in COMMON else {}
+        named = {str(self): False} if self in CASES + NETWORK_CASES else {}
+        return {self.env_id: True} | common | named
+
     def __str__(self) -> str:
         words = [f"{k}={v}" if isinstance(v, str) else k for k, v in self.options.items()]
         return "-".join([short(self.env_id), *words])
