@@ -165,6 +165,7 @@ def test_a_cache_that_cannot_be_written_is_left_alone(cache: Path) -> None:
     assert rewards(fusion_gym.make_task(LINEAR, backend="compiled")).all()
 
 
+@pytest.mark.slow
 def test_a_warm_start_needs_no_jax() -> None:
     lines = (
         "import sys, gymnasium, fusion_gym",

@@ -229,6 +229,7 @@ def test_the_exact_optimum_refuses_limited_buckets_of_sensors() -> None:
         assert fusion_gym.make_policy("optimal", free)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [OWN, BERNOULLI], ids=["constant", "bernoulli"])
 def test_jax_keeps_the_same_energy(options: Any) -> None:
     pytest.importorskip("jax")

@@ -2,7 +2,10 @@
 
 import copy
 import multiprocessing
+import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -326,6 +329,13 @@ def test_functional_environments_are_copied() -> None:
     for other, start in (copy.deepcopy((env, state)), pickle.loads(pickle.dumps((env, state)))):
         result = other.step(key, start, ACTION, params)
         jax.tree.map(np.testing.assert_array_equal, result, expected)
+
+
+@pytest.mark.slow
+def test_programs_at_the_default_level_of_xla_equal_numpy() -> None:
+    """The other tests compile without XLA's optimization."""
+    words = [sys.executable, "-m", "pytest", "-q", __file__, "-k", "equal_numpy and LinearFusion"]
+    subprocess.run(words, env=os.environ | {"XLA_FLAGS": ""}, check=True)
 
 
 @pytest.mark.slow

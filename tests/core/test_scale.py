@@ -154,6 +154,7 @@ def test_a_model_with_a_card_without_a_scale_is_refused(tmp_path: Path) -> None:
 FRONT: dict[str, Any] = {"memory": True, "cost_weight": "random", "price_range": "auto"}
 
 
+@pytest.mark.slow
 def test_prices_reach_from_60_to_12_percent_of_what_is_sustained() -> None:
     """At the ends of the range the cheapest of many thresholds sends about that much."""
     task = fusion_gym.make_task(LINEAR, **FRONT, **DRIFT)
