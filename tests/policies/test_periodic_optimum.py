@@ -12,11 +12,9 @@ import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies import periodic_optimum
 from fusion_gym.policies.periodic_optimum import PeriodicOptimum, steady_traces
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.schedules import Random
 from fusion_gym.validation import ConfigurationError
 
 ENV_ID = "fusion_gym/MarkovJumpTracking-v1"
@@ -71,17 +69,6 @@ def test_the_policy_reaches_its_trace_and_no_schedule_a_lower_one(options: Any) 
     result = steady_traces(task, others.reshape(3, 3, -1))
     assert policy.trace == pytest.approx(result.min(), rel=1e-9)
     assert result.max() > 1.2 * result.min()
-
-
-@pytest.mark.slow
-def test_it_beats_random_requests_and_knows_its_error() -> None:
-    task = markov()
-    best = run_episodes(task, PeriodicOptimum(task), 1500, 0)
-    rate = tuple(best.rate.mean(0))
-    other = run_episodes(task, Random(rate), 1500, 0)
-    assert best.mse.mean() < 0.9 * other.mse.mean()
-    gap = best.mse - best.bound_trace
-    assert abs(gap.mean()) <= 4 * gap.std() / np.sqrt(1500)
 
 
 def test_runs_in_other_steps_stand_side_by_side() -> None:

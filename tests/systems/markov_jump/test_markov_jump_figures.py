@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from parts import Parts
-from reference_markov_jump import options, random_model
 
 from agents.papers.markov_jump import trigger
 from agents.papers.walk import walk
@@ -113,18 +112,6 @@ def test_claimed_covariance_is_that_of_the_errors(kind: str) -> None:
     assert (np.abs(result - claimed) / scale).max() <= 0.05
     overall = np.abs(result.mean(0) - claimed.mean(0)) / scale.mean(0)
     assert overall.max() <= 0.015
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.slow
-def test_claimed_trace_of_other_models(seed: int) -> None:
-    """Asymmetric chain, two process noises, four sensors, a mean that is not zero."""
-    task = build(horizon=15, **options(random_model(seed)))
-    results = run_episodes(task, Random(0.3), 6000, 0)
-    assert results.bound_trace.mean() < 0.95 * task.plant.open_loop(15).sum()
-    deviation = results.mse.std() / np.sqrt(6000)
-    assert abs(results.mse.mean() - results.bound_trace.mean()) <= 4 * deviation
-    assert results.mse.mean() == pytest.approx(results.bound_trace.mean(), rel=0.05)
 
 
 # --- headroom ------------------------------------------------------------------------------------

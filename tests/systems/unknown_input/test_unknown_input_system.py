@@ -124,6 +124,3 @@ def test_library_and_plain_loop_walk_the_same_trajectories(kind: str, hold: floa
         np.testing.assert_allclose(fused_means[:, :4, run].T, x, rtol=1e-2, atol=1e-2)
         least = columns[:, 4, 4].min(0)
         np.testing.assert_allclose(fused_covariances[:, 4, 4, run], least, rtol=1e-6)
-
-
-# --- policies ------------------------------------------------------------------------------------
