@@ -2,15 +2,13 @@
 
 import pydoc
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
 from benchmark_rows import read_rows
 from markdown_it import MarkdownIt
-from page_blocks import LANGUAGES, blocks_of
+from page_blocks import LANGUAGES
 from paths import ROOT
 
 import fusion_gym
@@ -24,19 +22,6 @@ from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
-
-
-def test_the_evaluation_command_runs(tmp_path: Path) -> None:
-    words = next(
-        words
-        for block in blocks_of(Path("policies.md"), (ROOT / "docs/policies.md").read_text())
-        for _, words in block.commands()
-        if words[:2] == ["fusion-gym", "evaluate"]
-    )
-    words[words.index("--json") + 1] = str(tmp_path / "evaluation.json")
-    line = [sys.executable, "-m", "fusion_gym.commands", *words[1:]]
-    subprocess.run(line, cwd=ROOT, check=True, capture_output=True)
-    assert (tmp_path / "evaluation.json").exists()
 
 
 @pytest.mark.parametrize("path", [ROOT / "README.md", *DOCS], ids=lambda path: path.stem)
