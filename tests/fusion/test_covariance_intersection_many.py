@@ -1,7 +1,5 @@
 """Covariance intersection of many estimates, and the gap to the optimum that it certifies."""
 
-import warnings
-
 import numpy as np
 import pytest
 from difficult_estimates import KINDS, Array, estimates, many
@@ -90,28 +88,6 @@ def test_the_gap_closes_for_alike_and_for_extreme_estimates(
         single = many(mean[..., lane], covariance[..., lane])
         np.testing.assert_array_equal(single[1], fused[..., lane])
         np.testing.assert_array_equal(single[2], weights[:, lane])
-
-
-def test_lanes_of_every_number_of_active_estimates_stand_side_by_side() -> None:
-    """One alone, two, three, four, nobody, and a broken one: each as if it were on its own."""
-    generator = np.random.default_rng(8)
-    mean, covariance = estimates("crossed", 4, 3, 120)
-    active = generator.random((4, 120)) < 0.6
-    covariance[1, 2, 2, ::10] = np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        batch = many(mean, covariance, active)
-    broken = ~active.any(0) | (active[1] & (np.arange(120) % 10 == 0))
-    assert np.array_equal(np.isnan(batch[1]).all((0, 1)), broken)
-    assert np.array_equal(np.isnan(batch[0]).all(0), broken)
-    assert not np.isnan(batch[1][..., ~broken]).any()
-    assert set(active[:, ~broken].sum(0)) == {1, 2, 3, 4}
-    assert np.all(batch[2][~active] == 0.0)
-    for run in range(120):
-        lane = slice(run, run + 1)
-        single_values = many(mean[..., lane], covariance[..., lane], active[:, lane])
-        for single, batched in zip(single_values, batch, strict=True):
-            np.testing.assert_array_equal(single, batched[..., lane])
 
 
 @pytest.mark.parametrize("count", [3, 4])

@@ -151,8 +151,8 @@ def largest_errors(
             plant.initial_covariance[..., 0],
             sensors.measurement_matrix[..., 0],
             sensors.noise_covariance[..., 0],
-            (sensors.threshold, sensors.upper) if censored else None,
-            task.settings.get("stochastic_weight"),
+            limits=(sensors.threshold, sensors.upper) if censored else None,
+            weight=task.settings.get("stochastic_weight"),
         )
         for _ in range(runs)
     ]
