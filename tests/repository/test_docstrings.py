@@ -1,7 +1,9 @@
 """The library declares its parts, its reference has every name, and the examples run."""
 
 import doctest
+import functools
 import inspect
+import pickle
 import re
 from typing import Any
 
@@ -10,7 +12,7 @@ from paths import ROOT
 
 import fusion_gym
 from docs.tables import task_of
-from fusion_gym import evaluation
+from fusion_gym import evaluation, recordings
 from fusion_gym.core.options import CommonOptions
 from fusion_gym.docstrings import read
 from fusion_gym.envs import registration
@@ -27,6 +29,7 @@ from fusion_gym.policies.registry import (
     policy_names,
     policy_parameters,
 )
+from fusion_gym.recordings import FittedPlant, Recording, fit
 from fusion_gym.training.algorithms import TABLE
 
 POLICY_NAMES = [*policy_names("rule"), *policy_names("reference")]
@@ -139,10 +142,23 @@ def test_a_docstring_names_every_argument(name: str) -> None:
         assert inspect.signature(result).parameters.keys() <= described
 
 
+FITS: dict[bytes, FittedPlant] = {}
+
+
+@functools.wraps(fit)
+def fit_once(recording: Recording, **options: Any) -> FittedPlant:
+    """The same fit is part of several examples."""
+    key = pickle.dumps((recording, options))
+    if key not in FITS:
+        FITS[key] = fit(recording, **options)
+    return FITS[key]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_an_example_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registration, "ENVIRONMENTS", dict(registration.ENVIRONMENTS))
     monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))
+    monkeypatch.setattr(recordings, "fit", fit_once)
     text = inspect.getdoc(owner(name)) or ""
     test = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
     assert test.examples
