@@ -1,4 +1,4 @@
-"""Worker processes end with the process that they work for, also where that was killed."""
+"""Worker processes end with the process that they work for, and a pool keeps the order."""
 
 import contextlib
 import os
@@ -6,7 +6,11 @@ import signal
 import subprocess
 import sys
 
+import pytest
 from paths import ROOT
+
+from agents.workers import Call, Pool, run_parallel
+from fusion_gym.validation import ConfigurationError
 
 # A parent that waits for its worker, which says its number and would work for a minute.
 PARENT = """
@@ -43,3 +47,20 @@ def test_a_worker_ends_soon_after_its_parent_was_killed() -> None:
         end_of(parent)
     finally:
         kill_all(parent)
+
+
+def test_a_pool_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"address = 'tcp://x' .*backend='loky'"):
+        Pool(2, "loky", "tcp://x")
+    with (
+        pytest.raises(ConfigurationError, match=r"address = 'nowhere' .*backend='dask'"),
+        Pool(2, "dask", "nowhere").connect(),
+    ):
+        pass
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["loky", "dask"])
+def test_a_pool_returns_results_in_their_order(backend: str) -> None:
+    calls = [Call(1.0, pow, (2, exponent)) for exponent in range(6)]
+    assert run_parallel(calls, Pool(2, backend), "powers") == [1, 2, 4, 8, 16, 32]  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from difficult_estimates import KINDS, Array, estimates, parts
+from difficult_estimates import KINDS, Array, estimates, many, parts
 from scipy.optimize import minimize_scalar
 
 from fusion_gym.fusion.intersection import covariance_intersection, inverse_covariance_intersection
@@ -85,16 +85,21 @@ def test_a_worse_estimate_is_dropped_whichever_side_it_is_on(rule: str) -> None:
     assert np.all(good_first.gains[1] == 0.0)
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", [*RULES, "many"])
 def test_a_covariance_that_is_none_spoils_only_its_own_lane(rule: str) -> None:
-    mean, covariance = estimates("alike", 2, 3, 3)
-    clean = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
+    def fuse() -> tuple[Array, ...]:
+        if rule == "many":
+            return many(mean, covariance)
+        return parts(RULES[rule](mean[0], covariance[0], mean[1], covariance[1]))
+
+    mean, covariance = estimates("alike", 4 if rule == "many" else 2, 3, 3)
+    clean = fuse()
     covariance[1, 0, 0, 1] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        spoiled = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
-    assert np.all(np.isnan(spoiled.covariance[..., 1]))
-    for first, other in zip(parts(spoiled), parts(clean), strict=True):
+        spoiled = fuse()
+    assert np.all(np.isnan(spoiled[1][..., 1]))
+    for first, other in zip(spoiled, clean, strict=True):
         assert np.array_equal(first[..., [0, 2]], other[..., [0, 2]])
 
 

@@ -56,9 +56,7 @@ def attempt(command: str, words: list[str], log: Path, seconds: float | None) ->
 
 def begun(command: str, folder: Path) -> bool:
     """Whether the command needs --resume to go on."""
-    if command == "train":
-        return (folder / "run" / "config.yaml").exists()
-    return False
+    return command == "train" and (folder / "run" / "config.yaml").exists()
 
 
 def main() -> None:

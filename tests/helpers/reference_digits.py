@@ -49,17 +49,19 @@ class ExactFilter:
     """A filter of one run: ``mean`` (n,) and ``covariance`` (n, n), which start at time 0.
 
     ``rows`` (sensors, m, n) and ``noise`` (sensors·m, sensors·m) are the sensors'; of the Tobit
-    Kalman filter ``limits``, low and high (sensors, m), are where they are censored.
+    Kalman filter ``limits``, low and high (sensors, m), are where they are censored. By the
+    ``weight`` (sensors,) of a stochastic trigger silence is what was expected, with R + 1/Z.
     """
 
     def __init__(
         self, transition: Any, process: Any, mean: Any, start: Any, rows: Any, noise: Any,
-        limits: tuple[Any, Any] | None = None,
+        limits: tuple[Any, Any] | None = None, weight: Any = None,
     ) -> None:  # fmt: skip
         mp.dps = DIGITS
         self.transition, self.process = exact(transition), exact(process)
         self.mean, self.covariance = exact(mean), exact(start)
         self.rows, self.noise, self.limits = exact(rows), exact(noise), limits
+        self.weight = None if weight is None else exact(weight)
 
     def step(self, measurement: Any, granted: Any) -> None:
         """Predict, then take the granted (sensors,) of the measurements (sensors, m)."""
@@ -71,7 +73,8 @@ class ExactFilter:
     def take(self, measurement: Any, granted: Any) -> None:
         """Take the granted (sensors,) of the measurements (sensors, m)."""
         sensors, channels, _ = self.rows.shape
-        taken = np.flatnonzero(np.repeat(granted, channels))
+        arrived = np.repeat(granted, channels)
+        taken = np.flatnonzero(arrived | (self.weight is not None))
         if not taken.size:
             return
         rows = self.rows.reshape(sensors * channels, -1)[taken]
@@ -80,12 +83,16 @@ class ExactFilter:
         if self.limits is not None:
             for place, channel in enumerate(taken.tolist()):
                 low, high = (float(np.ravel(limit)[channel]) for limit in self.limits)
-                q, value, ratio = tobit(expected[place], noise[place, place], low, high)
+                q, mean, ratio = tobit(expected[place], noise[place, place], low, high)
                 rows[place] = rows[place] * q
-                expected[place], noise[place, place] = value, noise[place, place] * ratio
+                expected[place], noise[place, place] = mean, noise[place, place] * ratio
+        value = np.where(arrived[taken], exact(np.ravel(measurement)[taken]), expected)
+        if self.weight is not None:
+            places = np.flatnonzero(~arrived)
+            noise[places, places] += 1 / np.repeat(self.weight, channels)[places]
         cross = rows @ self.covariance
         gain = solve(cross @ rows.T + noise, cross).T
-        self.mean = self.mean + gain @ (exact(np.ravel(measurement)[taken]) - expected)
+        self.mean = self.mean + gain @ (value - expected)
         covariance = self.covariance - gain @ cross
         self.covariance = (covariance + covariance.T) / 2
 
@@ -144,7 +151,8 @@ def largest_errors(
             plant.initial_covariance[..., 0],
             sensors.measurement_matrix[..., 0],
             sensors.noise_covariance[..., 0],
-            (sensors.threshold, sensors.upper) if censored else None,
+            limits=(sensors.threshold, sensors.upper) if censored else None,
+            weight=task.settings.get("stochastic_weight"),
         )
         for _ in range(runs)
     ]

@@ -211,7 +211,10 @@ def exact_bound_update(
 def tobit_update(
     mean: Array, covariance: Array, matrix: Array, variance: Array, threshold: Array, value: Array
 ) -> tuple[Array, Array]:
-    """The standard Tobit Kalman filter: (5)-(7), (22), (23) with κ₁ = 1 and S = diag(R v)."""
+    """The standard Tobit Kalman filter: (5)-(7), (22), (23) with κ₁ = 1 and S = diag(R v).
+
+    Without thresholds it is the Kalman filter.
+    """
     free = np.isneginf(threshold)
     level = np.where(free, 0.0, threshold)
     root = np.sqrt(variance)
@@ -227,15 +230,6 @@ def tobit_update(
     keep = np.eye(len(mean)) - gain @ weighted
     bound = keep @ covariance @ keep.T + gain @ np.diag(spread) @ gain.T
     return mean + gain @ (value - expected), bound
-
-
-def kalman_update(
-    mean: Array, covariance: Array, matrix: Array, variance: Array, value: Array
-) -> tuple[Array, Array]:
-    """The Kalman filter, in information form."""
-    weight = matrix.T @ np.diag(1 / variance)
-    bound = np.linalg.inv(np.linalg.inv(covariance) + weight @ matrix)
-    return mean + bound @ weight @ (value - matrix @ mean), bound
 
 
 # --- the whole simulation ------------------------------------------------------------------------
@@ -317,12 +311,11 @@ def simulate(
                 )
                 posterior = (exact_float(mean)[:, 0], exact_float(bound))
             elif answered[m]:
-                sensor = (example.matrices[m], example.variances[m])
-                posterior = (
-                    tobit_update(prior, spread, *sensor, example.thresholds[m], values[m])
-                    if kind == "tobit"
-                    else kalman_update(prior, spread, *sensor, values[m])
-                )
+                level = example.thresholds[m]
+                if kind == "kalman":  # which knows of none
+                    level = np.full_like(level, -math.inf)
+                sensor = (example.matrices[m], example.variances[m], level)
+                posterior = tobit_update(prior, spread, *sensor, values[m])
             new_mean.append(posterior[0])
             new_covariance.append(posterior[1])
         information = [np.linalg.inv(bound) for bound in new_covariance]

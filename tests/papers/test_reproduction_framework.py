@@ -14,7 +14,6 @@ from command_runs import Ended, call
 from hostile_folder import contents
 from paths import ROOT
 
-from agents import cache
 from agents.papers import checks, page, paper
 from agents.papers.numbers import FAILS, HOLDS, Number
 from fusion_gym.validation import ConfigurationError
@@ -168,13 +167,6 @@ def test_a_piece_that_fails_leaves_the_others(
     calls.clear()
     reproduce("one", "--resume")
     assert build_parts(calls) == ["one/second"]
-
-
-def test_an_edit_of_the_code_simulates_again(calls: Calls, monkeypatch: pytest.MonkeyPatch) -> None:
-    reproduce("one")
-    monkeypatch.setattr(cache, "code_of", lambda module: "other")
-    reproduce("one", "--resume")
-    assert build_parts(calls) == 2 * ["one/first", "one/second"]
 
 
 # --- verdicts -----------------------------------------------------------------------------------

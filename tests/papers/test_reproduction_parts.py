@@ -278,18 +278,6 @@ def test_printed_equations_are_as_printed(latent: float) -> None:
     assert 0.6 * printed("variance")[1] == pytest.approx(drawn.var(), rel=0.03)
 
 
-def test_readings_are_run() -> None:
-    """Each is another filter or another system; the first is the environment's own."""
-    errors = {}
-    for reading in biased.ROUND_ROBIN_READINGS:
-        task = biased.reading_task(reading)
-        name = "always" if task.network.access == "any" else "round_robin"
-        errors[reading] = biased.squares(task, name, 3, 0).mean()
-    assert len(set(errors.values())) == len(biased.ROUND_ROBIN_READINGS)
-    own = fusion_gym.make_task(biased.OSCILLATOR)
-    assert errors["corrected equations"] == biased.squares(own, "round_robin", 3, 0).mean()
-
-
 def test_bounds_of_a_filter_that_is_never_censored() -> None:
     """With ᾱ = β̄ = 0 the upper bound in its own correction is the Riccati equation itself."""
     task = fusion_gym.make_task(biased.TRACKING)

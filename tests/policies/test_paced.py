@@ -9,12 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fusion_gym import make_task
-from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.schedules import Paced
 
-ENV_ID = "fusion_gym/TobitOscillator-v1"
 LENGTH = 400
 
 
@@ -87,11 +83,3 @@ def test_staggered_sensors_of_one_rate_are_even_together(
     assert widest_miss(together, sensors * rate) < 1
     at_once = requests(Paced(float(rate), staggered=False), sensors)
     np.testing.assert_array_equal(at_once, np.broadcast_to(at_once[0], at_once.shape))
-
-
-def test_the_rates_of_an_evaluation() -> None:
-    """100 steps: the counts are exact where 100 r is whole, else within one."""
-    task = make_task(ENV_ID, tokens="unlimited")
-    results = run_episodes(task, make_policy("paced:rate=0.17/0.5/0.333", task), 3, seed=0)
-    np.testing.assert_allclose(results.rate[:, :2], [[0.17, 0.5]] * 3, rtol=1e-12)
-    assert np.all(np.abs(results.rate[:, 2] - 0.333) < 0.01)

@@ -10,38 +10,21 @@ from paths import ROOT
 
 from fusion_gym import seeds
 
-# Each package may import from the floors below its own, and from itself.
-FLOORS = {
-    "arrays": 0,
-    "declaration": 0,
-    "docstrings": 0,
-    "entries": 0,
-    "errors": 0,
-    "gaussian": 0,
-    "importing": 0,
-    "linalg": 0,
-    "lowering": 0,
-    "namespace": 0,
-    "option_file": 0,
-    "seeds": 0,
-    "validation": 0,
-    "version": 0,
-    "yaml_text": 0,
-    "fusion": 1,
-    "recordings": 1,
-    "core": 2,
-    "systems": 3,
-    "envs": 4,
-    "solvers": 4,
-    "zoo": 4,
-    "jax": 5,
-    "policies": 5,
-    "evaluation": 6,
-    "configs": 6,
-    "output": 7,
-    "training": 8,
-    "commands": 9,
-}
+# Each package may import from the rows above its own, and from itself.
+ROWS = (
+    "arrays declaration docstrings entries errors gaussian importing linalg lowering namespace "
+    "option_file seeds validation version yaml_text",
+    "fusion recordings",
+    "core",
+    "systems",
+    "envs solvers zoo",
+    "jax policies",
+    "evaluation configs",
+    "output",
+    "training",
+    "commands",
+)
+FLOORS = {name: floor for floor, row in enumerate(ROWS) for name in row.split()}
 
 
 @functools.cache
@@ -83,7 +66,7 @@ def reached(module: str) -> set[str]:
 def floor(module: str) -> int | None:
     parts = module.split(".")
     if parts[0] == "agents":  # research, made with the library
-        return max(FLOORS.values()) + 1
+        return len(ROWS)
     return FLOORS[parts[1]] if len(parts) > 1 else None
 
 

@@ -19,6 +19,7 @@ from fusion_gym.envs.option_text import FOR_ALL, short
 from fusion_gym.envs.registration import ENVIRONMENTS, FusionSpec, class_name, options_of
 
 USER = ROOT / "tests/repository/typed_user.py"
+PLANT = ROOT / "tests/helpers/linear_case.py"  # a plant of the user's own
 SKIPPED = ",".join(f"mypy-{name}.*" for name in ("torch", "jax", "jaxlib", "pygame"))  # large ones
 STRICT = f"[mypy]\nstrict = True\n[{SKIPPED}]\nfollow_imports = skip\n"
 
@@ -35,26 +36,27 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "environment" / "bin" / "python"
 
 
-def strictly(python: Path, file: Path, folder: Path) -> str:
-    """What ``mypy --strict`` says of a user's file, outside of the repository."""
+def strictly(python: Path, folder: Path) -> str:
+    """What ``mypy --strict`` says of a user's files, outside of the repository."""
     (folder / "mypy.ini").write_text(STRICT)
     line = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini"]
-    line += ["--python-executable", str(python), str(file)]
+    line += ["--python-executable", str(python), "."]
     line += ["--cache-dir", str(ROOT / ".mypy_cache" / "strict")]
     return subprocess.run(line, cwd=folder, capture_output=True, text=True).stdout
 
 
 def test_mypy_strict_accepts_what_a_user_writes(installed: Path, tmp_path: Path) -> None:
     """It needs every ``type: ignore`` that stands there, so that no type is Any by chance."""
-    file = tmp_path / USER.name
-    file.write_text(USER.read_text())
-    output = strictly(installed, file, tmp_path)
+    for path in (USER, PLANT):
+        (tmp_path / path.name).write_text(path.read_text())
+    output = strictly(installed, tmp_path)
     assert output.startswith("Success"), output
 
 
 def test_what_a_user_writes_runs() -> None:
-    done = subprocess.run([sys.executable, USER], cwd=ROOT, capture_output=True, text=True,
-                          env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)  # fmt: skip
+    paths = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, PLANT.parent)))}
+    words = [sys.executable, str(USER)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, env=paths, check=True)
     assert "Interval(mean=" in done.stdout
 
 

@@ -1,7 +1,7 @@
-"""What a user writes with fusion-gym, for ``mypy --strict``: make, step, evaluate, one's own.
+"""What a user writes with fusion-gym, for ``mypy --strict``: make, step, evaluate, rules.
 
 Every ``type: ignore`` stands where the types must tell a mistake: mypy tells those that it does not
-need. It runs as well: ``python tests/repository/typed_user.py``.
+need. It runs as well, beside ``tests/helpers/linear_case.py``.
 """
 
 from dataclasses import dataclass
@@ -9,13 +9,12 @@ from typing import Any, ClassVar, assert_type
 
 import gymnasium as gym
 import numpy as np
+from linear_case import build
 from numpy.typing import NDArray
 
 import fusion_gym
-from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge, Signals
-from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import (
     EpisodeResults,
@@ -30,7 +29,6 @@ from fusion_gym.evaluation import (
     watch,
 )
 from fusion_gym.policies.base import Policy, Requests, Rule, parameter
-from fusion_gym.systems.nonlinear import NonlinearSystem
 from fusion_gym.systems.tobit.linear import LinearFusionOptions
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 from fusion_gym.validation import number
@@ -113,55 +111,11 @@ def worst(error: Array, covariance: Array) -> Array:
     return np.asarray(np.abs(error).max(axis=0), dtype=np.float64)
 
 
-class Drift(NonlinearSystem):
-    """A plant of one's own: a walk that is drawn towards zero, with two gauges."""
-
-    def __init__(self, noise: float) -> None:
-        super().__init__(
-            ("place",), sensors=2, process_channels=1,
-            initial_mean=[1.0], initial_covariance=[[0.1]],
-        )  # fmt: skip
-        self.noise = noise
-
-    def move(self, state: Array, noise: Array) -> Array:
-        """The next state."""
-        return np.tanh(state) + 0.2 * noise
-
-    def measure(self, state: Array, noise: Array) -> Array:
-        """Both gauges."""
-        return np.stack([state, state]) + self.noise * noise
-
-    def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Linearised at the mean."""
-        slope = 1.0 - np.tanh(mean) ** 2
-        return np.tanh(mean), linalg.congruence(slope[None], covariance) + 0.04
-
-    def update(
-        self, mean: Array, covariance: Array, sensor: int, measurement: Array
-    ) -> tuple[Array, Array]:
-        """A Kalman filter's."""
-        gain = covariance[0] / (covariance[0] + self.noise**2)
-        return mean + gain * (measurement - mean), (1.0 - gain) * covariance
-
-
-@dataclass(frozen=True)
-class DriftOptions(CommonOptions):
-    """A drifting place with two gauges."""
-
-    noise: float = 0.5
-
-
-def build(options: DriftOptions) -> Scenario:
-    """The scenario of these options."""
-    drift = Drift(options.noise)
-    return Scenario(options, drift.plant, drift.estimator)
-
-
 def evaluate() -> tuple[Interval, Interval]:
     """Rules and plants of one's own, evaluated on the same noise."""
-    fusion_gym.register("typed/Drift-v0", build)
+    fusion_gym.register("typed/Linear-v0", build)
     fusion_gym.register_policy("old_news", OldNews)
-    task = fusion_gym.make_task("typed/Drift-v0", noise=0.3, error=worst, horizon=20)
+    task = fusion_gym.make_task("typed/Linear-v0", error=worst, horizon=20)
     assert_type(task, Task)
     policies: dict[str, Policy] = {
         "always": fusion_gym.make_policy("always", task),

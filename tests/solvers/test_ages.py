@@ -36,6 +36,17 @@ def test_the_index_of_an_age_is_that_of_kadota(drop: float) -> None:
     np.testing.assert_allclose(index, (1.0 - drop) * age * (age - 1) / 2 + age, rtol=1e-4)
 
 
+def moves(source: AgeSource) -> list[tuple[Array, Array]]:
+    """The law of the next (age, state), and the cost, of silence and of a transmission."""
+    t, d, longest = source.transition, source.drop, len(source.costs) - 1
+    older, new = np.eye(longest + 1, k=1), np.zeros((longest + 1, longest + 1))
+    older[longest, longest], new[:, 1] = 1.0, 1.0
+    late, loss = np.einsum("kx,sy->ksxy", older, t), t @ d
+    fresh = np.einsum("kx,sy,y->ksxy", older, t, d) + np.einsum("kx,sy,y->ksxy", new, t, 1.0 - d)
+    stay = np.repeat(source.costs[:, None], len(d), axis=1)
+    return [(late, stay), (fresh, source.price + loss * stay + (1.0 - loss) * source.costs[0])]
+
+
 def test_at_the_index_both_decisions_cost_the_same() -> None:
     """By value iteration of a separate program, for a Gilbert-Elliott channel."""
     drop, move = np.array([0.7, 0.2]), np.array([[0.7, 0.3], [0.1, 0.9]])
@@ -44,75 +55,30 @@ def test_at_the_index_both_decisions_cost_the_same() -> None:
     assert (np.diff(index, axis=0) > 0.0).all()
     assert (index[:, 1] > index[:, 0]).all()
     for age, state in ((2, 0), (4, 1), (9, 0)):
-        price, value = index[age - 1, state], {}
-        places = [(k, s) for k in range(1, 21) for s in (0, 1)]
-        value = dict.fromkeys(places, 0.0)
+        source, value = AgeSource(costs, index[age - 1, state], drop, move, 1.21), np.zeros((21, 2))
         for _ in range(4000):
-            both = {p: decisions(value, costs, drop, move, price, *p) for p in places}
-            new = {p: min(pair) for p, pair in both.items()}
-            value = {p: 0.5 * value[p] + 0.5 * (new[p] - new[1, 0]) for p in places}
-        silent, sent = decisions(value, costs, drop, move, price, age, state)
+            both = [cost + np.einsum("ksxy,xy->ks", law, value) for law, cost in moves(source)]
+            new = np.minimum(*both)
+            value = 0.5 * value + 0.5 * (new - new[1, 0])
+        silent, sent = (each[age, state] for each in both)
         assert silent == pytest.approx(sent, rel=1e-5)
 
 
-def decisions(
-    value: dict[tuple[int, int], float],
-    costs: Array,
-    drop: Array,
-    move: Array,
-    price: float,
-    age: int,
-    state: int,
-) -> tuple[float, float]:
-    """The costs to go of silence and of a transmission."""
-    silent, sent, older = 0.0, price, min(age + 1, len(costs) - 1)
-    for after in (0, 1):
-        late = costs[age] + value[older, after]
-        silent += move[state, after] * late
-        fresh = costs[0] + value[1, after]
-        sent += move[state, after] * (drop[after] * late + (1.0 - drop[after]) * fresh)
-    return silent, sent
-
-
 def least_cost(sources: tuple[AgeSource, ...]) -> float:
-    """The optimum of two sources on one channel, by loops over the states."""
-    longest = len(sources[0].costs) - 1
-    ages, states = range(1, longest + 1), range(len(sources[0].drop))
-    value = np.zeros((longest + 1, len(states), longest + 1, len(states)))
-    change = np.zeros_like(value)
+    """The optimum of two sources on one channel, by value iteration."""
+    first, second = map(moves, sources)
+    value = np.zeros(2 * first[0][1].shape)
     for _ in range(600):
-        new = np.zeros_like(value)
-        moves = []
-        for i, source in enumerate(sources):
-            # E over the channel's next state, as functions of (age, last state).
-            t, d = source.transition, source.drop
-            late = np.zeros((longest + 1, len(states), longest + 1, len(states)))
-            for k in ages:
-                for s in states:
-                    for after in states:
-                        late[k, s, min(k + 1, longest), after] += t[s, after]
-            fresh = np.zeros_like(late)
-            for k in ages:
-                for s in states:
-                    for after in states:
-                        fresh[k, s, min(k + 1, longest), after] += t[s, after] * d[after]
-                        fresh[k, s, 1, after] += t[s, after] * (1.0 - d[after])
-            stay = np.array([[source.costs[k] for _ in states] for k in range(longest + 1)])
-            loss = np.array([t[s] @ d for s in states])
-            sent = source.price + loss * stay + (1.0 - loss) * source.costs[0]
-            moves.append(((late, stay), (fresh, sent)))
-            assert i < 2
         options = []
-        for first, second in ((0, 0), (1, 0), (0, 1)):
-            (p, c), (q, e) = moves[0][first], moves[1][second]
+        for i, j in ((0, 0), (1, 0), (0, 1)):
+            (p, c), (q, e) = first[i], second[j]
             ahead = np.einsum("ksxy,xyuv,mnuv->ksmn", p, value, q)
-            options.append(ahead + c[:, :, None, None] + e[None, None])
-        new = np.minimum.reduce(options)
-        change = (new - value)[1:, :, 1:]
-        value = value + 0.7 * (new - value - (new - value)[1, 0, 1, 0])
-        if np.ptp(change) < 1e-9:
+            options.append(ahead + c[:, :, None, None] + e)
+        change = np.minimum.reduce(options) - value
+        value = value + 0.7 * (change - change[1, 0, 1, 0])
+        if np.ptp(change[1:, :, 1:]) < 1e-9:
             break
-    return float(change.mean())
+    return float(change[1:, :, 1:].mean())
 
 
 def test_the_optimum_of_two_sources_is_that_of_a_separate_program() -> None:

@@ -77,17 +77,6 @@ def monte_carlo_room(covariance: Any, draws: int) -> Any:
     return 5 * np.sqrt((np.outer(variance, variance) + covariance**2) / draws)
 
 
-def test_process_noise_has_its_covariance() -> None:
-    plant, draws = make(), 200_000
-    noise = np.random.default_rng(0).normal(size=(1, draws))
-    moved = plant.advance(np.zeros((2, draws)), noise)
-    empirical = moved @ moved.T / draws
-    assert np.all(np.abs(empirical - RANK_ONE) <= monte_carlo_room(RANK_ONE, draws))
-    # One scalar noise: every draw lies along the gain, and both signs occur.
-    assert np.abs(GAIN[1] * moved[0] - GAIN[0] * moved[1]).max() < 1e-15
-    assert abs((moved[0] > 0).mean() - 0.5) < 5 * 0.5 / np.sqrt(draws)
-
-
 def test_full_noise_and_initial_state_have_their_covariances() -> None:
     covariance = np.array([[0.5, -0.3], [-0.3, 0.9]])
     plant, draws = make(process_covariance=covariance), 200_000
@@ -101,17 +90,6 @@ def test_full_noise_and_initial_state_have_their_covariances() -> None:
     centred = start - [[5.0], [0.0]]
     assert np.all(np.abs(centred.mean(1)) <= 5 * np.sqrt(np.diagonal(target) / draws))
     assert np.all(np.abs(centred @ centred.T / draws - target) <= monte_carlo_room(target, draws))
-
-
-def test_prediction_is_the_formula() -> None:
-    generator = np.random.default_rng(3)
-    mean, factor = generator.normal(size=(2, 5)), generator.normal(size=(2, 3, 5))
-    covariance = np.einsum("ikN,jkN->ijN", factor, factor)
-    prior_mean, prior = make().predict(mean, covariance)
-    np.testing.assert_allclose(prior_mean, TURN @ mean, rtol=1e-14)
-    for run in range(5):
-        expected = TURN @ covariance[..., run] @ TURN.T + RANK_ONE
-        np.testing.assert_allclose(prior[..., run], expected, rtol=1e-13)
 
 
 def test_open_loop_is_what_simulation_gives() -> None:

@@ -52,6 +52,12 @@ def made(kind: Any = PPO, local: bool = False, **options: Any) -> tuple[Task, Mo
     return task, ModelPolicy(model, task, trained=ModelView(local=local)), rule
 
 
+@pytest.fixture(scope="module")
+def parts() -> tuple[Task, ModelPolicy, Any]:
+    """A task, an untrained agent and a rule, of a scheduler."""
+    return made()
+
+
 def requests(task: Task, policy: Any, episodes: int = 30) -> Any:
     return run_episodes(task, policy, episodes, 0)
 
@@ -81,8 +87,8 @@ def test_the_ends_of_the_mixture_are_the_rule_and_the_agent(
             assert 0.0 < ours.requests.mean() < 1.0
 
 
-def test_between_two_prices_the_numbers_are_linear_in_the_logarithm() -> None:
-    task, agent, rule = made()
+def test_between_two_prices_the_numbers_are_linear_in_the_logarithm(parts: Any) -> None:
+    task, agent, rule = parts
     points = [CalibrationPoint(0.1, 0, 0.5, -0.3), CalibrationPoint(1.6, 1, 1.0, 0.1)]
     policy = CalibratedPolicy(task, [agent, agent], [1.0, 2.0], rule, points)
     number, mixture, threshold = policy.at(np.array([0.01, 0.2, 0.4, 0.8, 9.0]))
@@ -91,8 +97,8 @@ def test_between_two_prices_the_numbers_are_linear_in_the_logarithm() -> None:
     assert [*number[:2], *number[3:]] == [0, 0, 1, 1]
 
 
-def test_the_slope_is_the_regression_of_logits_on_log_ratios() -> None:
-    task, agent, rule = made()
+def test_the_slope_is_the_regression_of_logits_on_log_ratios(parts: Any) -> None:
+    task, agent, rule = parts
     slopes = fit_slopes(CalibratedPolicy(task, [agent], (), rule, ()), [0.3], 30)
     batch, samples = EpisodeBatch.seeded(task, 30, seeds.CALIBRATION.start), []
     batch.price = np.full(30, 0.3)
@@ -112,9 +118,11 @@ def saved(agent: ModelPolicy, folder: Path) -> Path:
     return folder / "agent.zip"
 
 
-def test_a_hopeless_agent_leaves_the_rule_and_a_bad_rule_is_mended(tmp_path: Path) -> None:
+def test_a_hopeless_agent_leaves_the_rule_and_a_bad_rule_is_mended(
+    tmp_path: Path, parts: Any
+) -> None:
     """At fresh episodes a rule that sends far too often is cheaper by a higher threshold."""
-    task, agent, _ = made()
+    task, agent, _ = parts
     prices, episodes, output = (0.05, 0.3, 2.0), (8, 100), tmp_path / "policy.zip"
     files = [saved(agent, tmp_path)]
     rows = calibrate(task, files, prices, episodes, output)
@@ -131,8 +139,8 @@ def test_a_hopeless_agent_leaves_the_rule_and_a_bad_rule_is_mended(tmp_path: Pat
     assert ours < 0.97 * theirs
 
 
-def test_of_several_agents_a_price_has_the_best(tmp_path: Path) -> None:
-    task, agent, _ = made()
+def test_of_several_agents_a_price_has_the_best(tmp_path: Path, parts: Any) -> None:
+    task, agent, _ = parts
     files, output = [saved(agent, tmp_path)] * 2, tmp_path / "policy.zip"
     text = RULE.format(own="false", margin=1)
     rows = calibrate(task, files, (0.05, 2.0), (4, 20), output, text)
@@ -142,14 +150,14 @@ def test_of_several_agents_a_price_has_the_best(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rule", ["os:system", "always", "priced_threshold_other:threshold=1"])
-def test_a_rule_of_another_kind_is_refused(tmp_path: Path, rule: str) -> None:
-    task, agent, _ = made()
+def test_a_rule_of_another_kind_is_refused(tmp_path: Path, rule: str, parts: Any) -> None:
+    task, agent, _ = parts
     with pytest.raises(ConfigurationError, match=r"rule = .* must be a priced_threshold"):
         calibrate(task, [saved(agent, tmp_path)], (0.05, 2.0), (2, 4), tmp_path / "o.zip", rule)
 
 
-def test_a_file_is_the_policy(tmp_path: Path) -> None:
-    task, agent, rule = made()
+def test_a_file_is_the_policy(tmp_path: Path, parts: Any) -> None:
+    task, agent, rule = parts
     points = [CalibrationPoint(0.05, 0, 0.0, -0.2), CalibrationPoint(2.0, 0, 0.5, 0.1)]
     policy = CalibratedPolicy(task, [agent], [0.3], rule, points)
     text = RULE.format(own="false", margin=1.7)
@@ -166,8 +174,8 @@ def test_a_file_is_the_policy(tmp_path: Path) -> None:
         make_policy(f"model:{tmp_path / 'policy.zip'}", task)
 
 
-def test_without_its_calibration_a_file_is_the_agent(tmp_path: Path) -> None:
-    task, agent, _ = made()
+def test_without_its_calibration_a_file_is_the_agent(tmp_path: Path, parts: Any) -> None:
+    task, agent, _ = parts
     text, file = RULE.format(own="false", margin=1.7), saved(agent, tmp_path)
     point, output = CalibrationPoint(0.3, 0, 1.0, 0.0), tmp_path / "policy.zip"
     save_calibrated(text, [0.3], [point], [file], output)
@@ -188,8 +196,8 @@ def test_without_its_calibration_a_file_is_the_agent(tmp_path: Path) -> None:
     assert output.read_bytes() == content
 
 
-def test_an_evaluation_draws_no_actions_of_a_calibrated_policy(tmp_path: Path) -> None:
-    task, agent, _ = made()
+def test_an_evaluation_draws_no_actions_of_a_calibrated_policy(tmp_path: Path, parts: Any) -> None:
+    task, agent, _ = parts
     text, output = RULE.format(own="false", margin=1.7), tmp_path / "policy.zip"
     point = CalibrationPoint(0.3, 0, 0.5, 0.0)
     save_calibrated(text, [0.3], [point], [saved(agent, tmp_path)], output)
@@ -224,9 +232,9 @@ def test_agents_of_a_file_with_other_content_are_refused(tmp_path: Path, content
         {"rule": "os:system"},
     ],
 )
-def test_a_file_with_other_content_is_refused(tmp_path: Path, content: Any) -> None:
+def test_a_file_with_other_content_is_refused(tmp_path: Path, content: Any, parts: Any) -> None:
     """In one line, and no rule of a file runs code."""
-    task, agent, _ = made()
+    task, agent, _ = parts
     right = {"points": [POINT], "slopes": [1.0], "rule": RULE.format(own="false", margin=1)}
     with zipfile.ZipFile(tmp_path / "policy.zip", "w") as archive:
         archive.writestr("calibration.json", json.dumps(right | content))
@@ -235,8 +243,8 @@ def test_a_file_with_other_content_is_refused(tmp_path: Path, content: Any) -> N
         make_policy(f"model:{tmp_path / 'policy.zip'}", task)
 
 
-def test_agents_without_a_logit_a_sensor_are_refused() -> None:
-    task, _, rule = made()
+def test_agents_without_a_logit_a_sensor_are_refused(parts: Any) -> None:
+    task, _, rule = parts
     for kind in (DQN, PPO):
         envs = fusion_gym.make_sb3_vec_env(LINEAR, 2, **OPTIONS, action="discrete")
         discrete = fusion_gym.make_task(LINEAR, **OPTIONS, action="discrete")
@@ -283,8 +291,10 @@ def test_a_failed_calibration_ends_the_training_with_its_error(
 
 
 @pytest.mark.parametrize("threshold", [-0.4, 0.6])
-def test_a_mixture_weighs_the_logit_over_its_slope_and_the_log_ratio(threshold: float) -> None:
-    task, agent, rule = made()
+def test_a_mixture_weighs_the_logit_over_its_slope_and_the_log_ratio(
+    threshold: float, parts: Any
+) -> None:
+    task, agent, rule = parts
     point = CalibrationPoint(0.3, 0, 0.3, threshold)
     policy = CalibratedPolicy(task, [agent], [0.2], rule, [point])
     batch = EpisodeBatch.seeded(task, 200, 0)

@@ -17,7 +17,7 @@ from fusion_gym.training import run
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.counterfactual import CounterfactualPPO, Decisions, RolloutBatch, _Step
+from fusion_gym.training.counterfactual import CounterfactualPPO, Decisions, _Step
 from fusion_gym.validation import ConfigurationError
 
 RUNS = 5
@@ -36,33 +36,6 @@ def env_of(name: str, **more: Any) -> tuple[PrivilegedVecEnv, Any]:
     options, local, kind = CASES[name]
     task = fusion_gym.make_task(ENV, **{"filter": "tobit", "horizon": 7, **options, **more})
     return PrivilegedVecEnv(task, RUNS, local=local), kind
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_choices_are_the_actions_of_the_space(name: str) -> None:
-    """Their probabilities are torch's; their values those of the requests that they stand for."""
-    env, kind = env_of(name)
-    decisions = Decisions(env, kind)
-    rows, width = env.num_envs, 3 if decisions.binary else int(env.action_space.n)  # type: ignore[attr-defined]
-    generator = torch.Generator().manual_seed(0)
-    logits = torch.randn((rows, width), generator=generator)
-    values = decisions.log_probabilities(decisions.by_run(logits))
-    torch.testing.assert_close(values.exp().sum(-1), torch.ones(values.shape[:-1]))
-    rng = np.random.default_rng(0)
-    for _ in range(4):
-        choice = rng.integers(0, decisions.choices, values.shape[:2])
-        actions = decisions.actions(choice)
-        assert all(
-            env.action_space.contains(action)
-            for action in actions.astype(np.int8 if decisions.binary else np.int64)
-        )
-        expected = (
-            BERNOULLI(logits=logits).log_prob(torch.as_tensor(actions).float()).sum(-1)
-            if decisions.binary
-            else CATEGORICAL(logits=logits).log_prob(torch.as_tensor(actions))
-        )
-        own = values.gather(-1, torch.as_tensor(choice)[..., None]).sum((-1, -2))
-        torch.testing.assert_close(own, expected.reshape(RUNS, -1).sum(-1))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -178,38 +151,6 @@ def test_returns_and_advantages_are_those_of_the_definition() -> None:
             for i in range(3):
                 target = step.values[run_, i] - mean[i]
                 np.testing.assert_allclose(rollout.advantages[row, i], target, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["all", "flips", "local"])
-def test_the_first_step_climbs_the_expected_value(name: str) -> None:
-    """Where nothing has changed yet, the surrogate's gradient is that of Σ π_a Q_a, in each factor,
-    and of the log-probability of what was done times δ."""
-    env, kind = env_of(name)
-    model = CounterfactualPPO(
-        "MlpPolicy", env, alternatives=kind, ent_coef=0.0, vf_coef=0.0, batch_size=30
-    )
-    decisions = model._decisions
-    generator = torch.Generator().manual_seed(3)
-    rows = (6, 3) if name == "local" else (6,)
-    observations = torch.randn((*rows, *env.observation_space.shape), generator=generator)  # type: ignore[misc]
-    old = decisions.log_probabilities(model._logits(observations, None)).detach()
-    values = torch.randn(old.shape, generator=generator)
-    surplus = torch.randn(6, generator=generator)
-    choice = torch.randint(0, decisions.choices, old.shape[:2], generator=generator)
-    mean = (old.exp() * values).sum(-1, keepdim=True)
-    rollout = RolloutBatch(
-        observations, None, choice, old, values - mean, surplus, torch.zeros(6), torch.zeros(6)
-    )
-    loss, parts = model._loss(rollout, torch.arange(6), 0.5, 0.2)
-    assert float(parts["clip_fraction"]) == 0.0
-    new = decisions.log_probabilities(model._logits(observations, None))
-    expected = (new.exp() * values).sum((-1, -2)).mean() / 0.5
-    path = (new.gather(-1, choice[..., None]).sum((-1, -2)) * surplus).mean() / 0.5
-    weights = list(model.policy.action_net.parameters())
-    single = torch.autograd.grad(-loss, weights)
-    two = torch.autograd.grad(expected + path, weights)
-    for left, right in zip(single, two, strict=True):
-        torch.testing.assert_close(left, right, rtol=1e-4, atol=1e-6)
 
 
 SETTINGS: list[Any] = [

@@ -72,15 +72,20 @@ def test_traffic_entropy_and_validation_at_each_price_are_shown(
             assert visible[name][-1] == pytest.approx(row[key])
 
 
-def test_the_records_at_each_price_are_those_of_the_agent(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def front(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a training by PPO."""
+    return Path(trained(tmp_path_factory.mktemp("front"), "ppo").output)
+
+
+def test_the_records_at_each_price_are_those_of_the_agent(front: Path) -> None:
     """Of the likeliest action; drawn actions of a new agent send about half of the time."""
-    trained(tmp_path, "ppo")
-    record, options = read_records(tmp_path / "run")[-1], FRONT | {"price_range": None}
+    record, options = read_records(front)[-1], FRONT | {"price_range": None}
     prices = [row["price"] for row in record["prices"]]
     np.testing.assert_allclose(prices, np.geomspace(0.01, 0.32, 5))
     for row in record["prices"]:
         task = make_task(ENV, **options | {"cost_weight": row["price"]})
-        agent = f"model:{tmp_path / 'run' / 'final_model.zip'},price={row['price']!r}"
+        agent = f"model:{front / 'final_model.zip'},price={row['price']!r}"
         results = run_episodes(task, make_policy(agent, task), 8, 500_000_000)
         assert row["mse"] == pytest.approx(results.mse.mean())
         assert row["tokens"] == pytest.approx(results.tokens.mean())
@@ -92,11 +97,9 @@ def test_the_records_at_each_price_are_those_of_the_agent(tmp_path: Path) -> Non
     assert record["relative_cost"] == pytest.approx(relative.mean())
 
 
-def test_the_best_model_has_the_least_relative_cost(tmp_path: Path) -> None:
-    trained(tmp_path, "ppo")
-    records = read_records(tmp_path / "run")
-    least = min(record["relative_cost"] for record in records)
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+def test_the_best_model_has_the_least_relative_cost(front: Path) -> None:
+    least = min(record["relative_cost"] for record in read_records(front))
+    summary = json.loads((front / "summary.json").read_text())
     assert summary["best_validation"]["relative_cost"] == least
 
 

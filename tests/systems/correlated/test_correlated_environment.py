@@ -35,22 +35,6 @@ def signals(innovation: Array, start: bool) -> Signals:
     )
 
 
-def test_threshold_follows_the_last_requested_innovation() -> None:
-    trigger = AdaptiveInnovation(threshold=(0.6, 1.0), offset=(0.2, 0.0), sensitivity=(0.9, 2.0))
-    draw, last = np.random.default_rng(1), np.zeros((2, 5))
-    for step in range(60):
-        if step in (0, 30):  # a new episode forgets
-            last[:] = 0.0
-        innovation = draw.normal(size=(2, 1, 5))
-        requests = trigger(signals(innovation, step in (0, 30)))
-        for sensor, (a, b, c) in enumerate(((0.6, 0.2, 0.9), (1.0, 0.0, 2.0))):
-            for lane in range(5):
-                size = abs(innovation[sensor, 0, lane])
-                asks = size**2 >= a * math.exp(-(b + c * last[sensor, lane]))
-                assert requests[sensor, lane] == asks
-                last[sensor, lane] = size if asks else last[sensor, lane]
-
-
 def test_memory_of_one_run_restarts_alone_and_reset_forgets() -> None:
     trigger = AdaptiveInnovation(threshold=1.0, offset=0.0, sensitivity=10.0)
     large, small = np.full((1, 1, 2), 3.0), np.full((1, 1, 2), 0.5)

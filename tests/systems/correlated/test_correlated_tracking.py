@@ -76,6 +76,7 @@ def reference(
     order: tuple[int, ...],
     scale: float,
     requested: Array | None,
+    trigger: tuple[Array, Array, Array],
 ) -> tuple[Array, Array, Array, Array]:
     """Truth (T, 3), fused mean (T, 3), covariance (T, 3, 3), requests (T, 3) of a run."""
     x = np.array([0.3, 0.1, 0.2]) + math.sqrt(scale) * start
@@ -91,7 +92,8 @@ def reference(
         for i in range(3):
             epsilon = y[i] - mean[i + 1][i]
             if requested is None:
-                request[i] = epsilon**2 >= 0.6 * math.exp(-(0.2 + 0.9 * abs(last[i])))
+                level, offset, slope = (numbers[i] for numbers in trigger)
+                request[i] = epsilon**2 >= level * math.exp(-(offset + slope * abs(last[i])))
             else:
                 request[i] = requested[step, i]
             if request[i]:
@@ -127,7 +129,10 @@ def test_library_and_plain_loop_walk_the_same_trajectories(
     start = draw.standard_normal((task.plant.start_channels, runs))
     noise = draw.standard_normal((steps, task.plant.noise_channels, runs))
     requests = None if rate is None else draw.random((steps, 3, runs)) < rate
-    policy = AdaptiveInnovation()
+    numbers = np.full((3, 3), [[0.6], [0.2], [0.9]])
+    if fusion == "sci":  # of each sensor its own
+        numbers = np.array([[0.6, 1.0, 0.4], [0.2, 0.0, 0.1], [0.9, 2.0, 0.0]])
+    policy = AdaptiveInnovation(*map(tuple, numbers))
     state, result = parts.start(start), []
     for step in range(steps):
         state = parts.sense(state, noise[step])
@@ -147,6 +152,7 @@ def test_library_and_plain_loop_walk_the_same_trajectories(
             order or (0, 1, 2),
             scale,
             None if requests is None else requests[..., run],
+            tuple(numbers),
         )
         for mine, other in zip(zip(*result, strict=True), expected, strict=True):
             values = np.array([entry[..., run] for entry in mine], dtype=np.float64)

@@ -1,8 +1,7 @@
-"""Parts of the Markov jump system against plain loops, closed forms, samples and FilterPy."""
+"""Parts of the Markov jump system against plain loops, closed forms and samples."""
 
 from typing import Any
 
-import filterpy.kalman
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -118,41 +117,6 @@ def test_measurements_carry_the_noise_that_moves_the_plant_next() -> None:
 
 
 # --- local filters -------------------------------------------------------------------------------
-
-
-def test_one_mode_without_fading_and_coupling_is_filterpys_kalman_filter() -> None:
-    model = random_model(6, modes=1, sensors=2)
-    model |= {
-        "periods": [1, 3],
-        "values": np.ones((2, 1)),
-        "shares": np.ones((2, 1)),
-        "coupling": np.zeros((2, 2)),
-    }
-    filters = filters_of(model)
-    gain, phi = model["gains"][0], model["transitions"][0]
-    draw = np.random.default_rng(0)
-    mean = np.tile(model["mean"][None, :, None], (2, 1, 1))
-    noise_mean = np.zeros((2, 2, 1))
-    others = []
-    for sensor in range(2):
-        other = filterpy.kalman.KalmanFilter(dim_x=2, dim_z=1)
-        other.x, other.P, other.F = model["mean"].copy(), model["start"].copy(), phi
-        other.Q, other.R = gain @ model["noise"] @ gain.T, model["variance"][sensor]
-        other.H = model["matrices"][sensor]
-        others.append(other)
-    for time in range(1, 30):
-        now, place = filters.at(np.array([time - 1])), filters.at(np.array([time]))
-        measurement = draw.normal(size=(2, 1))
-        sampled = np.array([[True], [time % 3 == 0]])
-        prior = filters.predict(mean, noise_mean, now)
-        mean, noise_mean, _ = filters.update(prior, measurement, sampled, place)
-        for sensor, other in enumerate(others):
-            other.predict()
-            if sampled[sensor, 0]:
-                other.update(measurement[sensor])
-            np.testing.assert_allclose(mean[sensor, :, 0], other.x, rtol=1e-9)
-            values = filters.covariance[sensor, sensor, ..., place[0]]
-            np.testing.assert_allclose(values, other.P, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

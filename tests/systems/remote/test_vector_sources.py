@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -40,16 +39,6 @@ THREE = [CART, ROOM, SPIN]
 def make(**options: Any) -> Task:
     """Three sources of different sizes, unless the options say otherwise."""
     return fusion_gym.make_task(ENV, **{"sources": THREE, "horizon": 30} | options)
-
-
-def test_the_lines_of_a_user() -> None:
-    env = gym.make(ENV, sources=(6, 0), access="slots", slots=2, channel="gilbert_elliott")
-    observation, _ = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
-    for _ in range(5):
-        observation, _, *_, info = env.step(env.action_space.sample())
-        assert env.observation_space.contains(observation)
-        assert info["granted"].sum() <= 2
 
 
 class Filter:

@@ -79,47 +79,6 @@ def test_oscillator_meets_its_figures(
     np.testing.assert_allclose(results[: len(figures)], figures, rtol=tolerance)
 
 
-# --- invariants ---------------------------------------------------------------------------------
-
-
-def test_federation_is_the_centralised_tobit_filter() -> None:
-    """Against a plain loop over the scheduled sensor, per run, on the same measurements."""
-    task = fusion_gym.make_task(OSCILLATOR)
-    policy = make_policy("round_robin", task)
-    batch = EpisodeBatch.seeded(task, 4, 0)
-    policy.reset(4)
-    plant: Any = task.plant.dynamics  # type: ignore[attr-defined]
-    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
-    means = [plant.initial_mean[:, 0].copy() for _ in range(4)]
-    covariances = [plant.initial_covariance[..., 0].copy() for _ in range(4)]
-    for step in range(30):
-        measurement = batch.signals()["measurement"].copy()
-        batch.step(policy(batch.signals()))
-        mean, covariance = batch.delivered.estimate.mean, batch.delivered.estimate.covariance
-        for run in range(4):
-            prior = transition @ means[run]
-            spread = transition @ covariances[run] @ transition.T + process
-            means[run], covariances[run] = tobit_update(
-                prior, spread, step % 2, measurement[step % 2, 0, run]
-            )
-            np.testing.assert_allclose(mean[:, run], means[run], rtol=1e-7, atol=1e-9)
-            np.testing.assert_allclose(covariance[..., run], covariances[run], rtol=1e-7)
-
-
-def tobit_update(mean: Any, covariance: Any, sensor: int, value: float) -> tuple[Any, Any]:
-    """Equations (18)-(25) as corrected, with plain normal distribution functions."""
-    row, deviation = np.eye(3)[sensor], np.sqrt(0.6)
-    latent = row @ mean
-    low, high = (-5.0 - latent) / deviation, (5.0 - latent) / deviation
-    inside = stats.truncnorm(low, high)
-    a, b = stats.norm.cdf(low), stats.norm.sf(high)
-    p = stats.norm.sf(low) - b if low > 0 else stats.norm.cdf(high) - a
-    expected = -5.0 * a + 5.0 * b + p * (latent + deviation * inside.mean())
-    cross = p * covariance @ row
-    gain = cross / (p**2 * row @ covariance @ row + 0.6 * inside.var())
-    return mean + gain * (value - expected), covariance - np.outer(gain, cross)
-
-
 # --- assumed-density filter ---------------------------------------------------------------------
 
 

@@ -49,24 +49,6 @@ def optimal(granted: NDArray[np.bool_], prior: Array) -> Array:
     return np.linalg.inv(np.linalg.inv(prior) + C[mask].T @ np.linalg.inv(noise) @ C[mask])
 
 
-def test_the_joint_filter_is_the_optimal_one() -> None:
-    """Its covariances in closed form, and its errors' spread in 2,000 runs."""
-    task = task_of()
-    assert task.settings["filter"] == "joint"
-    batch = EpisodeBatch.seeded(task, 2000, 0)
-    generator = np.random.default_rng(1)
-    covariance, normalised = optimal(np.ones(3, dtype=np.bool_), np.eye(2)), []
-    for _ in range(30):
-        granted = generator.random(3) < 0.6
-        covariance = optimal(granted, A @ covariance @ A.T + W)
-        outcome = batch.step(np.repeat(granted[:, None], 2000, axis=1))
-        claimed = task.estimator.covariance(batch.delivered.estimate)
-        np.testing.assert_allclose(claimed[..., 0], covariance, atol=1e-10)
-        normalised.append((outcome.error * np.linalg.solve(covariance, outcome.error)).sum(0))
-    spread = np.mean(normalised, axis=0).std() / np.sqrt(2000)
-    assert abs(np.mean(normalised) - 2.0) < 4.0 * spread
-
-
 def test_the_noise_has_the_covariance_that_was_given() -> None:
     """Of a plant that stands still at zero the measurements are the noise."""
     still = {"transition": np.eye(2), "process_covariance": np.zeros((2, 2)),

@@ -7,7 +7,6 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.estimator import Reception
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
 
@@ -60,19 +59,6 @@ def test_the_covariance_is_the_mean_squared_error_under_a_schedule(options: dict
         tolerance = 4.0 * products.std(-1) / runs**0.5
         assert (abs(products.mean(-1) - state.covariance[..., 0]) <= tolerance).all()
         assert np.ptp(state.covariance, axis=-1).max() < 1e-12
-
-
-def test_variance_signals_are_those_of_single_deliveries() -> None:
-    batch = EpisodeBatch.seeded(make(**MIXED), 4, 0)
-    batch.step(np.eye(3, 4, dtype=np.bool_))
-    signals, estimator = batch.signals(), batch.task.estimator
-    for sensor in range(3):
-        sent = np.zeros((3, 4), dtype=np.bool_)
-        sent[sensor] = True
-        covariance = estimator.update(batch.state.estimate, Reception(sent)).covariance
-        trace = np.einsum("iin->n", covariance)
-        reduced = signals["silent_variance"] - signals["variance_reduction"][sensor]
-        np.testing.assert_allclose(reduced, trace, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 import fusion_gym
@@ -74,27 +73,6 @@ def test_the_centre_is_the_optimal_filter(states: int, sizes: list[int]) -> None
     mean = np.mean(normalised)
     spread = np.mean(normalised, axis=0).std() / np.sqrt(400)
     assert abs(mean - states) < 5.0 * spread
-
-
-def test_estimates_are_those_of_filterpy() -> None:
-    """A sensor with a diagonal covariance reports its channels as they are."""
-    options = system(3, 3, [2, 1]) | {"measurement_covariances": [[[0.3, 0.0], [0.0, 0.2]], 0.5]}
-    task = fusion_gym.make_task(LINEAR, tokens="unlimited", **options)
-    batch = EpisodeBatch.seeded(task, 1, 5)
-    matrix = np.vstack(options["measurement_matrices"])
-    beside = KalmanFilter(dim_x=3, dim_z=3)
-    beside.x, beside.P = options["initial_mean"].copy(), options["initial_covariance"].copy()
-    beside.F, beside.Q = options["transition"], options["process_covariance"]
-    beside.H, beside.R = matrix, np.diag([0.3, 0.2, 0.5])
-    first = batch.state.estimate.held[..., 0]  # known to the centre
-    beside.update(np.concatenate([first[0], first[1, :1]]))
-    for _ in range(30):
-        measured = batch.signals()["measurement"][..., 0]
-        assert measured[1, 1] == 0.0  # the second sensor has one channel
-        beside.predict()
-        beside.update(np.concatenate([measured[0], measured[1, :1]]))
-        batch.step(np.ones((2, 1), dtype=np.bool_))
-        np.testing.assert_allclose(batch.delivered.estimate.mean[:, 0], beside.x, atol=1e-9)
 
 
 def test_censored_sensors_get_a_filter_that_knows_it() -> None:

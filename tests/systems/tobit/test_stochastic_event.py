@@ -4,19 +4,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filter_problems import Problem, outcomes, random_problem
-from filterpy.kalman import KalmanFilter as FilterPyFilter
+from filter_problems import Problem, outcomes
 from numpy.typing import NDArray
-from parts import Parts
 from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_task
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.measurements import StochasticEvent
-from fusion_gym.systems.tobit.filters import KalmanFilter, StochasticEventFilter
+from fusion_gym.systems.tobit.filters import StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 OSCILLATOR = "fusion_gym/TobitOscillator-v1"
@@ -108,58 +105,6 @@ def test_silence_against_quadrature() -> None:
     assert result[2][0, 0, 0] == pytest.approx(centre, abs=1e-10)
     spread = (posterior * (x[:, 0] - centre) ** 2).sum()
     assert result[3][0, 0, 0, 0] == pytest.approx(spread, rel=1e-9)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3])
-def test_silence_adds_information(size: int) -> None:
-    """P'⁻¹ = P⁻¹ + Cᵀ (R + Z⁻¹)⁻¹ C, one matrix at a time; a delivery is the Kalman filter's."""
-    problem = random_problem(5 + size, size, 3, lanes=6, threshold=-INFINITY)
-    weight = (0.7, 4.0)
-    node = StochasticEventFilter.create(problem.sensors, weight)
-    result = outcomes(node, problem)
-    plain = outcomes(KalmanFilter(problem.sensors), problem)
-    for place in (0, 1, 2):  # deliveries, and the silent mean
-        np.testing.assert_array_equal(result[place], plain[place])
-    for sensor in range(2):
-        matrix = problem.sensors.measurement_matrix[sensor, :, :, 0]
-        noise = np.diag(problem.sensors.variance[sensor, :, 0] + 1 / weight[sensor])
-        for lane in range(6):
-            prior = np.linalg.inv(problem.covariance[sensor, :, :, lane])
-            expected = np.linalg.inv(prior + matrix.T @ np.linalg.solve(noise, matrix))
-            silent = result[3][sensor, :, :, lane]
-            np.testing.assert_allclose(silent, expected, rtol=1e-9, atol=1e-11)
-            np.testing.assert_array_equal(silent, silent.T)
-
-
-def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
-    """Against FilterPy with all sensors stacked: y with R, or C x̂ with R + Z⁻¹ when silent."""
-    weight, runs = (1.0, 0.3, 3.0), 3
-    task = task_of(ROTATION, weight)
-    plant, sensors = task.plant.dynamics, task.estimator.centre.sensors
-    filters = []
-    for _ in range(runs):
-        other = FilterPyFilter(dim_x=2, dim_z=6)
-        other.x, other.P = plant.initial_mean[:, 0].copy(), plant.initial_covariance[..., 0]
-        other.F, other.Q = plant.transition[..., 0], plant.process_covariance[..., 0]
-        other.H = sensors.measurement_matrix[..., 0].reshape(6, 2)
-        filters.append(other)
-    generator, batch = np.random.default_rng(2), EpisodeBatch.seeded(task, runs, 0)
-    for _ in range(25):
-        granted = generator.random((3, runs)) < 0.4
-        measurement = batch.signals()["measurement"].copy()
-        batch.step(granted)
-        mean, covariance = Parts.of(task).fused(batch.delivered)
-        for run, other in enumerate(filters):
-            other.predict()
-            received = np.repeat(granted[:, run], 2)
-            value = np.where(received, measurement[..., run].ravel(), other.H @ other.x)
-            noise = sensors.variance[..., 0].ravel() + ~received / np.repeat(weight, 2)
-            other.update(value, R=np.diag(noise))
-            np.testing.assert_allclose(mean[:, run], other.x, rtol=1e-8, atol=1e-10)
-            np.testing.assert_allclose(covariance[..., run], other.P, rtol=1e-8, atol=1e-12)
-
-
-# --- the rate -----------------------------------------------------------------------------------
 
 
 # --- the trigger --------------------------------------------------------------------------------
