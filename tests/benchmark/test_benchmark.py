@@ -56,6 +56,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return [*places, "--workers", "1"]
 
 
+@pytest.mark.slow
 def test_from_prices_to_pages_and_zoo(
     small: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,6 +117,7 @@ def test_from_prices_to_pages_and_zoo(
     assert {f"{point['cost']:.4g}" for point in card["test"]["points"]} <= costs
 
 
+@pytest.mark.slow
 def test_the_suite_of_channels_tests_each_rule_and_agents_that_assign(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,6 +251,7 @@ def test_prices_are_slopes_of_the_front(monkeypatch: pytest.MonkeyPatch) -> None
     assert prices == pytest.approx([share**-2 for share in shares], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "count"), [("settings", 8), ("channels", 2)])
 def test_all_tasks_and_rules_of_the_benchmark_exist(
     name: Any, count: int, monkeypatch: pytest.MonkeyPatch

@@ -45,6 +45,7 @@ def test_a_result_is_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert again["nested"] == first["nested"]
 
 
+@pytest.mark.slow
 @given(first=PLAIN, second=PLAIN)
 def test_inputs_share_a_key_only_if_they_are_equal(first: dict[str, Any], second: Any) -> None:
     same = cache._key(evaluate, first) == cache._key(evaluate, second)

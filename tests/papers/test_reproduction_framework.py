@@ -214,6 +214,7 @@ def test_an_undecided_claim_gets_five_times_the_episodes(undecided: Calls) -> No
     assert numbers["made"]["first"]["episodes"] == 5 * USUAL
 
 
+@pytest.mark.slow
 def test_a_check_names_verdicts_that_contradict_the_pages(undecided: Calls) -> None:
     reproduce("all")
     undecided.clear()

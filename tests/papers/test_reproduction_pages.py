@@ -89,6 +89,7 @@ EPISODES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_page_is_that_of_a_fresh_run(name: str) -> None:
     episodes = EPISODES[name]
@@ -99,6 +100,7 @@ def test_the_page_is_that_of_a_fresh_run(name: str) -> None:
     check_pictures(paper, data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "figure", "changes", "label"),
     [

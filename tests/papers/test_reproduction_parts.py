@@ -392,6 +392,7 @@ def test_period_is_found(period: int) -> None:
 # --- adaptive innovation, unknown input ----------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratios", [(1.0, 0.3, 0.0), (0.2, 1.0, 0.5), (0.5, 0.5, 0.5)])
 def test_actual_covariances_are_those_of_the_errors(ratios: tuple[float, float, float]) -> None:
     """Of 20,000 errors of every estimate: within 5 standard errors; beside a lane at the bounds."""

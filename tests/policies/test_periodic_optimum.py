@@ -33,6 +33,7 @@ def _forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(periodic_optimum, "_cache", {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("packets", "best"), [(2, 2.333), (4, 1.727)])
 def test_known_optima(packets: int, best: float) -> None:
     policy = make_policy(f"periodic_optimum:packets={packets},period=6", markov())

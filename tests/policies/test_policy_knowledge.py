@@ -149,7 +149,11 @@ def tried(name: str) -> list[tuple[str, Knowledge, set[str]]]:
     return results
 
 
-@pytest.mark.parametrize("name", policy_names())
+LONG = {"rollout", "priced_threshold", "periodic_optimum", "whittle", "estimate_difference"}
+NAMES = [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in policy_names()]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_it_looks_at_what_its_class_has_and_at_nothing_else(name: str) -> None:
     """Nothing outside its class matters; what sets that apart from the one below does somewhere:
     it claims no more."""

@@ -45,6 +45,7 @@ def strictly(python: Path, folder: Path) -> str:
     return subprocess.run(line, cwd=folder, capture_output=True, text=True).stdout
 
 
+@pytest.mark.slow
 def test_mypy_strict_accepts_what_a_user_writes(installed: Path, tmp_path: Path) -> None:
     """It needs every ``type: ignore`` that stands there, so that no type is Any by chance."""
     for path in (USER, PLANT):
@@ -53,6 +54,7 @@ def test_mypy_strict_accepts_what_a_user_writes(installed: Path, tmp_path: Path)
     assert output.startswith("Success"), output
 
 
+@pytest.mark.slow
 def test_what_a_user_writes_runs() -> None:
     paths = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, PLANT.parent)))}
     words = [sys.executable, str(USER)]

@@ -109,6 +109,7 @@ def test_the_bounds_of_one_source_hold_for_all_ages(coefficient: float, drop: fl
     assert many.upper == pytest.approx(many.lower, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_rules_by_age_cost_at_least_the_optimum() -> None:
     """On the same noise; the optimum's cost is the solver's, but for the start at age 0."""
     task = make(2, horizon=400)

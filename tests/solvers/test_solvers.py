@@ -283,6 +283,7 @@ def test_gilbert_elliott_of_an_unstable_source_agrees_with_a_wider_grid() -> Non
 # --- several sources -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_joint_optimum_of_sources_that_share_nothing_is_the_sum() -> None:
     sources = (SourceProblem.create(price=3.0), SourceProblem.create(coefficient=0.8, price=6.0))
     joint = solve_joint_average(JointProblem.create(sources))
@@ -329,6 +330,7 @@ def test_dual_bound_of_an_episode() -> None:
     assert loose.cost == pytest.approx(sum(solve_finite(s, 30).cost for s in sources))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["good", "bad", "stationary"])
 def test_dual_bound_of_channels_that_start_in_a_state(start: str) -> None:
     """It lies below what always transmitting costs, and is the optimum where tokens abound."""

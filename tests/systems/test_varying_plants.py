@@ -126,11 +126,15 @@ SAME: list[tuple[str, dict[str, Any]]] = [
     (TRACKING, {"fusion": "ci"}),
 ]
 UNDER_JAX = [
-    pytest.param(*case, False, "jax", marks=pytest.mark.slow if number > 1 else ())
+    pytest.param(*case, False, "jax", marks=pytest.mark.slow if number > 0 else ())
     for number, case in enumerate(SAME)
     if case[1].get("filter") != "truncated"
 ]
-UNDER_NUMPY = [(*case, memory, "numpy") for case in SAME for memory in (False, True)]
+UNDER_NUMPY = [(*case, False, "numpy") for case in SAME]
+UNDER_NUMPY += [
+    pytest.param(*case, True, "numpy", marks=pytest.mark.slow if case[0] == TRACKING else ())
+    for case in SAME
+]
 
 
 @pytest.mark.parametrize(("env_id", "options", "memory", "backend"), [*UNDER_NUMPY, *UNDER_JAX])

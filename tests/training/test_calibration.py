@@ -118,6 +118,7 @@ def saved(agent: ModelPolicy, folder: Path) -> Path:
     return folder / "agent.zip"
 
 
+@pytest.mark.slow
 def test_a_hopeless_agent_leaves_the_rule_and_a_bad_rule_is_mended(
     tmp_path: Path, parts: Any
 ) -> None:

@@ -210,6 +210,7 @@ def test_it_needs_an_environment_that_can_branch() -> None:
         CounterfactualPPO("MlpPolicy", plain)
 
 
+@pytest.mark.slow
 def test_it_learns_what_ppo_does_not_see_yet(tmp_path: Path) -> None:
     """In 10,000 steps better than PPO after as many, and better than requests at random."""
     options = {"filter": "tobit", "random_start": True, "token_rate": 2.0, "cost_weight": 0.03}

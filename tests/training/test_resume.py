@@ -59,14 +59,19 @@ def end_at(monkeypatch: pytest.MonkeyPatch, step: int, how: str) -> None:
 
 
 CASES = [
-    pytest.param("ppo", "fixed", {}, marks=pytest.mark.slow),
-    pytest.param("ppo", "drawn", {}, marks=pytest.mark.slow),
     ("a2c", "fixed", {}),
-    ("dqn", "fixed", {}),
-    ("maskable_ppo", "drawn", {}),
-    ("recurrent_ppo", "fixed", {}),
-    ("counterfactual_ppo", "fixed", {"error": "mismatch"}),
-    ("counterfactual_maskable_ppo", "drawn", {"error": "excess"}),
+    *(
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in (
+            ("ppo", "fixed", {}),
+            ("ppo", "drawn", {}),
+            ("dqn", "fixed", {}),
+            ("maskable_ppo", "drawn", {}),
+            ("recurrent_ppo", "fixed", {}),
+            ("counterfactual_ppo", "fixed", {"error": "mismatch"}),
+            ("counterfactual_maskable_ppo", "drawn", {"error": "excess"}),
+        )
+    ),
 ]
 
 

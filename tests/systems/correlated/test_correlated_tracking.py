@@ -217,6 +217,7 @@ TABLE = {  # scale: rates, then MSE, actual and conservative trace of SCI and of
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scale", [1.0, *(pytest.param(scale, marks=pytest.mark.slow) for scale in (0.8, 0.6, 0.4))]
 )

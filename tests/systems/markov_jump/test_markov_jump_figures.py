@@ -105,6 +105,7 @@ def agreement(policy: Policy, runs: int, steps: int, seed: int) -> tuple[Array, 
     return values, claimed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["trigger", "random"])
 def test_claimed_covariance_is_that_of_the_errors(kind: str) -> None:
     """20,000 runs: within 5 % of the deviations at each time, within 1.5 % over all times."""

@@ -129,6 +129,7 @@ def walk(
     return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True)), initial
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_library_and_reference_walk_the_same_trajectories(case: str) -> None:
     options, how = CASES[case]

@@ -174,6 +174,7 @@ def test_denied_requests_leave_the_covariance_honest() -> None:
     assert 0.8 < result["nees"]["mean"] < 1.35
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threshold", [1.0, 2.0])
 def test_the_error_is_that_of_a_particle_filter(threshold: float) -> None:
     """Within 2 %, on the same 150 runs of 60 steps with 1,500 particles each."""
