@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import IDS, each_id, requests, short
+from cases import IDS, QUALITY, each_id, requests, short
 
 import fusion_gym
 from fusion_gym.core.access import collisions, first_requests, place_of
@@ -186,56 +186,39 @@ def test_try_once_discard_has_its_errors_at_equal_rate(name: str) -> None:
 
 # --- interfaces -----------------------------------------------------------------------------------
 
-ACCESS_OPTIONS: list[dict[str, Any]] = [
-    {"access": "slots", "slots": 2},
-    {"access": "try_once_discard"},
-    {"access": "collision", "channels": 2, "channel": "independent"},
+NAMES = ("LinearFusion", "CorrelatedTracking", "RemoteEstimation")
+PAIRS: dict[str, Any] = {"access": "assignment", "channels": 2}
+LOSSY = PAIRS | {"channel": "independent", "drop_probability": QUALITY}
+FADING = PAIRS | {"channel": "gilbert_elliott"}
+COLLISION = {"access": "collision", "channels": 2, "channel": "independent"}
+CHANNELS = np.array([[2], [1], [2]])  # asked for by number, or left to the network
+BACKEND_CASES: list[tuple[str, dict[str, Any], Any]] = [
+    *((name, {"access": "slots", "slots": 2}, None) for name in NAMES),
+    *((name, {"access": "try_once_discard"}, None) for name in NAMES),
+    *((name, COLLISION, None) for name in NAMES),
+    *((NAMES[1], options, asked) for options in (LOSSY, FADING) for asked in (None, CHANNELS)),
 ]
 
 
-@pytest.mark.parametrize("options", ACCESS_OPTIONS, ids=lambda options: options["access"])
-@pytest.mark.parametrize("name", ["LinearFusion", "CorrelatedTracking", "RemoteEstimation"])
+@pytest.mark.parametrize("case", BACKEND_CASES, ids=str)
 @pytest.mark.parametrize("backend", ["jax", "compiled"])
 def test_access_of_a_backend_is_that_of_numpy(
-    backend: str, name: str, options: dict[str, Any]
+    backend: str, case: tuple[str, dict[str, Any], Any]
 ) -> None:
     pytest.importorskip("jax")
+    name, options, asked = case
     more: dict[str, Any] = {"sensors": 3} if name == "RemoteEstimation" else {}
     tasks = [task_of(name, backend=kind, **options | more) for kind in ("numpy", backend)]
     batches = [EpisodeBatch.seeded(task, 4, 3) for task in tasks]
     for request in requests(tasks[0], 4, 8, rate=0.8):
-        outcomes = [batch.step(request) for batch in batches]
-        for part in ("granted", "arrived"):
+        outcomes = [batch.step(request if asked is None else request * asked) for batch in batches]
+        for part in ("requested", "granted", "arrived"):
             np.testing.assert_array_equal(*(getattr(outcome, part) for outcome in outcomes))
         np.testing.assert_allclose(*(outcome.error for outcome in outcomes), atol=1e-12)
         np.testing.assert_allclose(*(batch.observe() for batch in batches), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"access": "slot"}, r"access = 'slot' .*did you mean 'slots'"),
-        ({"slots": 2}, r"slots = 2 .* access='any'"),
-        ({"access": "single", "slots": 2}, r"slots = 2 .* access='single'"),
-        ({"access": "collision", "slots": 2}, r"slots = 2 .* access='collision'"),
-        ({"access": "slots", "slots": 4}, r"slots = 4 .* <= 3"),
-        ({"access": "slots", "slots": 0}, r"slots = 0 .* >= 1"),
-        ({"channels": 2}, r"channels = 2 .* access='any'"),
-        ({"access": "collision", "channels": 1.5}, r"channels = 1.5 .* whole number"),
-        ({"discrepancy": "held"}, r"discrepancy = 'held' .* access='any'"),
-        ({"access": "try_once_discard", "discrepancy": "age"}, r"discrepancy = 'age'"),
-        ({"access": "try_once_discard", "discrepancy_weights": (1, 0, 1)}, "discrepancy_weights"),
-        ({"discrepancy_weights": (1, 2, 1)}, r"discrepancy_weights .* access='any'"),
-        (
-            {"access": "collision", "filter": "truncated", "trigger": "send_on_delta"}
-            | {"trigger_threshold": 1.0},
-            "access = 'collision' .* no silence",
-        ),
-    ],
-)
-def test_options_without_a_use_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        task_of("RemoteEstimation", sensors=3, **options)
+    if options["access"] == "assignment":
+        with pytest.raises(ConfigurationError, match="channels from 1 to 2"):
+            batches[1].step(np.full((3, 4), 3))
 
 
 def test_simulations_compare_discrepancies_from_their_first_step() -> None:

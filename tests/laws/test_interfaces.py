@@ -1,5 +1,6 @@
 """Laws of the interfaces: the other libraries' own checks, and what an id promises."""
 
+import functools
 import inspect
 import warnings
 from collections.abc import Iterator
@@ -9,7 +10,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from cases import CASES, Case, actions, each_id, requests
+from cases import CASES, IDS, PAIRS, QUALITY, Case, each_id, requests, short
+from cases import actions as usual_actions
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.options import CommonOptions
+from fusion_gym.core.task import Task
 from fusion_gym.envs import registered
 from fusion_gym.envs.registration import class_name, options_of
 from fusion_gym.envs.single import FusionEnv
@@ -32,6 +35,8 @@ COMMON_CASES = [
     for case in CASES
     if not set(case.options) - {"information", "access", "clock", "error", "action", "error_weight"}
 ]
+ASSIGNED = PAIRS | {"channel": "independent", "drop_probability": QUALITY, "action": "assignment"}
+COMMON_CASES += [Case(i, ASSIGNED) for i in IDS if short(i) == "CorrelatedTracking"]
 each_case = pytest.mark.parametrize("case", COMMON_CASES, ids=str)
 each_default = pytest.mark.parametrize("case", [c for c in CASES if not c.options], ids=str)
 
@@ -41,6 +46,24 @@ def every_warning_is_an_error() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
+
+
+def actions(task: Task, request: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Actions (runs, …), of which those of an assignment give two channels to two sensors."""
+    if task.action == "assignment":
+        return request[:2].T * np.array([3, 1])
+    return usual_actions(task, request)
+
+
+def has_local_view(make: Any, case: Case) -> bool:
+    """Whether sensors can decide by themselves; else ``make`` refuses it."""
+    memory = case.local_memory if case.task().memory else case.local
+    if memory and case.task().action != "assignment":
+        return True
+    message = r"(information = 'centre'|delay = |action = 'assignment' .*local view)"
+    with pytest.raises(ConfigurationError, match=message):
+        make(case.env_id, **case.options)
+    return False
 
 
 @each_case
@@ -63,9 +86,7 @@ def test_pettingzoos_checks(env_id: str) -> None:
 
 @each_case
 def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
-    if not (case.local_memory if case.task().memory else case.local):
-        with pytest.raises(ConfigurationError, match=r"(information = 'centre'|delay = )"):
-            fusion_gym.parallel_env(case.env_id, **case.options)
+    if not has_local_view(fusion_gym.parallel_env, case):
         return
     env, task = fusion_gym.parallel_env(case.env_id, **case.options), case.task()
     view, bucket = SensorView(task), task.network.bucket
@@ -89,12 +110,11 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
 
 @each_case
 def test_sensors_rows_of_stable_baselines_are_the_schedulers_runs(case: Case) -> None:
-    if not (case.local_memory if case.task().memory else case.local):
-        with pytest.raises(ConfigurationError, match=r"(information = 'centre'|delay = )"):
-            fusion_gym.make_sb3_vec_env(case.env_id, 3, local=True, **case.options)
+    make = functools.partial(fusion_gym.make_sb3_vec_env, num_envs=3, seed=3, local=True)
+    if not has_local_view(make, case):
         return
     options = case.options | {"horizon": 5}
-    local = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, local=True, **options)
+    local = make(case.env_id, **options)
     whole = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, **options)
     whole.batch = EpisodeBatch(whole.task, 3, local.view.owner)  # remembers for whom it is compared
     whole.view.local = True  # and supposes what the sensors suppose
@@ -116,15 +136,15 @@ def test_sensors_rows_of_stable_baselines_are_the_schedulers_runs(case: Case) ->
             assert [info["episode"]["r"] for info in row_infos] == returns.tolist()
 
 
-@pytest.mark.parametrize("clock", [False, True])
+@pytest.mark.parametrize("more", [{}, {"clock": True}, ASSIGNED], ids=["time", "clock", "pairs"])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_agrees_with_gymnasiums_vector_of_single_environments(
-    mode: AutoresetMode, clock: bool
+    mode: AutoresetMode, more: dict[str, Any]
 ) -> None:
     """Runs 1 and 3 are reset in mid-episode, so that episodes end at different times."""
-    case = CASES[0]
+    case = Case(CASES[0].env_id, more)
     task = case.task()
-    options: dict[str, Any] = {"num_envs": 4, "horizon": 5, "clock": clock}
+    options: dict[str, Any] = {"num_envs": 4, "horizon": 5} | more
     ours: Any = gymnasium.make_vec(
         case.env_id, vectorization_mode="vector_entry_point", autoreset_mode=mode, **options
     )
@@ -144,7 +164,7 @@ def test_agrees_with_gymnasiums_vector_of_single_environments(
         action = actions(task, request)
         mine, other = ours.step(action), theirs.step(action)
         same(mine, other)
-        over = other[2 if clock else 3].copy()
+        over = other[2 if task.clock else 3].copy()
         endings.add(tuple(over.tolist()))
         if mode is AutoresetMode.DISABLED and over.any():
             reset(None, over)
