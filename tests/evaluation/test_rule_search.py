@@ -12,7 +12,7 @@ import fusion_gym
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import rule_loop, rule_search
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced, run_several
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced
 from fusion_gym.evaluation.rule_loop import make_loop
 from fusion_gym.evaluation.rule_search import (
     Generation,
@@ -51,19 +51,14 @@ def means_of(error_cost: Any, tokens: Any) -> EpisodeResults:
 def test_costs_beside_each_other_are_those_of_episodes() -> None:
     task, text = task_of(), "priced_threshold:threshold=0.3"
     rules = [f"{text},price={price}" for price in PRICES]
-    seeds = np.tile(np.arange(5, 11), 3)
-    prices = np.repeat(PRICES, 6)
+    seeds, prices = np.tile(np.arange(5, 11), 3), np.repeat(PRICES, 6)
     priced = run_priced(task, make_policy(text, task), seeds, prices)
-    briefs = run_several(task, [make_policy(rule, task) for rule in rules], 6, 5)
-    for place, (rule, price, brief) in enumerate(zip(rules, PRICES, briefs, strict=True)):
-        single = run_episodes(task, make_policy(rule, task), 6, 5)
-        np.testing.assert_array_equal(brief.error_cost, single.error_cost)
-        np.testing.assert_array_equal(brief.tokens, single.tokens)
-        cost = single.error_cost + price * single.tokens
-        np.testing.assert_array_equal(brief.cost(price), cost)
-        part = slice(6 * place, 6 * place + 6)
-        np.testing.assert_allclose(priced.cost(prices)[part], cost, rtol=1e-12)
-    assert len({float(brief.tokens.mean()) for brief in briefs}) == 3
+    singles = [run_episodes(task, make_policy(rule, task), 6, 5) for rule in rules]
+    costs = [
+        one.error_cost + price * one.tokens for one, price in zip(singles, PRICES, strict=True)
+    ]
+    np.testing.assert_allclose(priced.cost(prices), np.concatenate(costs), rtol=1e-12)
+    assert len({float(single.tokens.mean()) for single in singles}) == 3
 
 
 def test_a_search_from_a_bad_start_lowers_the_cost() -> None:

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import fields
@@ -17,6 +18,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from own_system import OWN_ID, WalkOptions, build
 from pettingzoo.test import parallel_api_test, parallel_seed_test
+from refusals import refused
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import fusion_gym
@@ -294,12 +296,10 @@ def test_an_unknown_option_is_named(case: Case) -> None:
         lambda **options: fusion_gym.make_sb3_vec_env(case.env_id, 2, **options),
         lambda **options: fusion_gym.parallel_env(case.env_id, **options),
     ):
-        message = rf"{case.env_id} got an unexpected keyword argument 'colour': .*known are access"
+        message = f"{case.env_id} got an unexpected keyword argument "
         for kind in (ConfigurationError, TypeError):
-            with pytest.raises(kind, match=message):
-                make(colour="red")
-    with pytest.raises(ConfigurationError, match="information = 'nobody'"):
-        fusion_gym.make_task(case.env_id, information="nobody")
+            refused(lambda make=make: make(colour="red"), message, "known are access", kind=kind)
+            refused(lambda make=make: make(horizn=1), message, "mean 'horizon'?", kind=kind)
 
 
 # Options that may be negative.
@@ -313,11 +313,10 @@ def test_what_an_option_cannot_be_is_refused_by_name(env_id: str, value: Any) ->
     """Where the library checks the options."""
     for option in (field.name for field in fields(options_of(env_id))):
         if env_id != OWN_ID and not (value == -1.0 and option in SIGNED):
-            with pytest.raises(ConfigurationError, match=rf"^{option}(\[\d\])? = ") as caught:
-                fusion_gym.make_task(env_id, **{option: value})
-            message = str(caught.value)
-            assert " allowed" in message
-            assert "\n" not in message
+            message = refused(
+                functools.partial(fusion_gym.make_task, env_id, **{option: value}), " allowed"
+            )
+            assert re.match(rf"{option}(\[\d\])? = ", message)
             assert not isinstance(value, str) or f"{option} = {value!r}" in message
 
 
