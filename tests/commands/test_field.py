@@ -108,10 +108,11 @@ def test_a_study_ends_in_the_settings_of_devices(
     few: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(field, "_WINDOWS", 50)  # of 20 steps
+    monkeypatch.setattr(field_study, "_CLOSE", 0.5)
     folder, tanks = tmp_path / "field", Recording.read("tanks")
     replace(tanks, values=tanks.values[:2000]).write(tmp_path / "log.csv")
     words = [str(tmp_path / "log.csv"), "--exact", "--output", str(folder), "--workers", "1"]
-    words += ["--timesteps", "1000"]
+    words += ["--timesteps", "300"]
     printed = succeed("field", words).out
     settings = yaml.safe_load((folder / "devices.yaml").read_text())
     assert list(settings) == ["inflow", "middle", "outflow"]

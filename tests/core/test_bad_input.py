@@ -16,9 +16,8 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
 TOBIT, REMOTE, CORRELATED = "TobitOscillator", "RemoteEstimation", "CorrelatedTracking"
-LINEAR, MARKOV, INPUT, BIASED = (
-    "LinearFusion", "MarkovJumpTracking", "UnknownInput", "BiasedOscillator",
-)  # fmt: skip
+LINEAR, MARKOV, INPUT = "LinearFusion", "MarkovJumpTracking", "UnknownInput"
+BIASED = "BiasedOscillator"
 ENV_ID = present_id(TOBIT)
 GILBERT_ELLIOTT, MEMORY = {"channel": "gilbert_elliott"}, {"memory": True}
 ESTIMATE, CENTRE, THREE = {"packet": "estimate"}, {"information": "centre"}, {"sensors": 3}
@@ -32,9 +31,7 @@ PAIRS = {"access": "assignment", "channels": 2, "tokens": "unlimited"}
 
 
 def make_vector(num_envs: Any = 3, env_id: str = ENV_ID, **options: Any) -> Any:
-    return gymnasium.make_vec(
-        env_id, num_envs, vectorization_mode="vector_entry_point", **options
-    ).unwrapped
+    return gymnasium.make_vec(env_id, num_envs, **options).unwrapped
 
 
 WAYS: tuple[Callable[..., Any], ...] = (

@@ -37,9 +37,7 @@ def build_parts(interface: str, kind: str) -> Step:
         single.reset(seed=0)
         return single.step
     if interface == "vector":
-        vector = gymnasium.make_vec(
-            ENV_ID, RUNS, vectorization_mode="vector_entry_point", **options
-        ).unwrapped
+        vector = gymnasium.make_vec(ENV_ID, RUNS, **options)
         vector.reset(seed=0)
         return vector.step
     rows = fusion_gym.make_sb3_vec_env(ENV_ID, RUNS, local=interface == "local", **options)

@@ -76,9 +76,8 @@ def test_an_agent_of_forty_sensors_is_saved_and_loaded(
         task = fusion_gym.make_task(LINEAR, **MANY, **options)
         for trust in (False, True):
             policy: Any = make_policy(f"model:{tmp_path / 'agent.zip'}", task, trust=trust)
-            np.testing.assert_array_equal(
-                policy.model.predict(observation, deterministic=True)[0], expected
-            )
+            actions = policy.model.predict(observation, deterministic=True)[0]
+            np.testing.assert_array_equal(actions, expected)
             assert policy.view.actions == envs.action_space
     fewer = MANY | {"measurement_matrices": MANY["measurement_matrices"][:39]}
     other = fusion_gym.make_task(LINEAR, **fewer)

@@ -72,15 +72,13 @@ def test_an_error_of_ones_own(own: Path) -> None:
         ("trace", lambda e, p, w: (w * np.diagonal(p).T).sum(0)),
     ):
         weights = np.array([[2.0], [0.5]])
-        task = fusion_gym.make_task(
-            TOBIT, filter="tobit", error=error, error_weight=3.0, state_weights=weights[:, 0]
-        )
+        options: Any = {"error_weight": 3.0, "state_weights": weights[:, 0], "filter": "tobit"}
+        task = fusion_gym.make_task(TOBIT, error=error, **options)
         batch = EpisodeBatch.seeded(task, 5, 0)
         outcome = batch.step(np.ones((3, 5), dtype=np.bool_))
         covariance = Parts.of(task).fused(batch.delivered)[1]
-        np.testing.assert_allclose(
-            -outcome.reward_error, 3.0 * expected(outcome.error, covariance, weights), rtol=1e-12
-        )
+        loss = 3.0 * expected(outcome.error, covariance, weights)
+        np.testing.assert_allclose(-outcome.reward_error, loss, rtol=1e-12)
         json.dumps(task.settings)
     assert fusion_gym.make_task(TOBIT, error=total).settings["error"].endswith("total")
 

@@ -40,9 +40,8 @@ def test_every_environment_draws_its_episode(env_id: str) -> None:
 
 def test_a_picture_shows_what_happened() -> None:
     """Ticks of requests that were granted and denied, in their colours; the censored region."""
-    env: Any = gym.make(
-        TOBIT, render_mode="rgb_array", initial_tokens=3.0, token_rate=0.0, sharing="fixed"
-    )
+    tokens: Any = {"initial_tokens": 3.0, "token_rate": 0.0, "sharing": "fixed"}
+    env: Any = gym.make(TOBIT, render_mode="rgb_array", **tokens)
 
     def counts() -> NDArray[Any]:
         granted, denied, censored = (0, 114, 178), (140, 140, 140), (247, 235, 241)
@@ -64,10 +63,9 @@ def test_a_picture_shows_what_happened() -> None:
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_vector_environment_draws_every_run(mode: str) -> None:
-    envs: Any = gym.make_vec(
-        TOBIT, num_envs=2, horizon=3, render_mode="rgb_array", autoreset_mode=mode
-    )
-    single: Any = gym.make(TOBIT, horizon=3, render_mode="rgb_array")
+    options: Any = {"horizon": 3, "render_mode": "rgb_array"}
+    envs: Any = gym.make_vec(TOBIT, num_envs=2, autoreset_mode=mode, **options)
+    single: Any = gym.make(TOBIT, **options)
     envs.reset(seed=0)
     single.reset(seed=1)
     for _ in range(2):

@@ -9,13 +9,8 @@ from fusion_gym.recordings import Recording
 
 ZERO = pd.Timestamp("1970-01-01")
 CODES = (-127.0, 85.0, -999.0, -9999.0, 9999.0)
-UNITS = {
-    "unix": 1.0,
-    "time_ms": 1e-3,
-    "elapsed [min]": 60.0,
-    "hours": 3600.0,
-    "excel days": 86400.0,
-}
+UNITS = {"unix": 1.0, "time_ms": 1e-3, "elapsed [min]": 60.0, "hours": 3600.0}
+UNITS |= {"excel days": 86400.0}
 ZEROS = {"unix": ZERO, "time_ms": ZERO, "excel days": pd.Timestamp("1899-12-30")}
 PLACES = {"excel days": 12, "time_ms": 3}
 CLOCKS = ("%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y/%m/%d %H:%M:%S.%f",
@@ -97,9 +92,8 @@ def draw_log(seed: int) -> Drawn:
     else:
         texts = list(real.strftime(clock))
     truth = pd.DataFrame(values, even, names)
-    separator, decimal = [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")][
-        draw.integers(5)
-    ]
+    signs = [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")]
+    separator, decimal = signs[draw.integers(5)]
     thousands = draw.choice(["", "", {".": ",", ",": "."}[decimal], " "])
     unit = draw.choice(["", " °C", " %"]) if layout == "wide" else ""
 

@@ -165,9 +165,8 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
     save = figures.save_figure
     monkeypatch.setattr(figures, "save_figure", lambda f, *to: (drawn.append(f), save(f, *to)))
     printed = succeed("demo", words).out
-    assert [sum(len(axes.containers) for axes in figure.axes) <= 6 for figure in drawn] == [
-        True
-    ] * 2
+    assert len(drawn) == 2
+    assert all(sum(len(axes.containers) for axes in figure.axes) <= 6 for figure in drawn)
     titles = [figure.get_suptitle().partition(" against ")[0] for figure in drawn]
     labels = ("Linear fusion, 2 sensors", "Tobit oscillator, 3 sensors")
     assert titles == [f"{label}: the calibrated agent" for label in labels]

@@ -5,11 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import IDS, QUALITY, each_id, requests, short
+from refusals import refused
 
 import fusion_gym
 from fusion_gym.core.access import collisions, first_requests, place_of
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rollout import Imagination
 from fusion_gym.validation import ConfigurationError
@@ -99,13 +100,8 @@ def test_try_once_discard_grants_the_largest_discrepancies(
     kind: str, slots: int, weights: Any
 ) -> None:
     """Of those that request, by the sensors' own signals."""
-    task = task_of(
-        "CorrelatedTracking",
-        access="try_once_discard",
-        discrepancy=kind,
-        slots=slots,
-        discrepancy_weights=weights,
-    )
+    options = {"discrepancy": kind, "slots": slots, "discrepancy_weights": weights}
+    task = task_of("CorrelatedTracking", access="try_once_discard", **options)
     batch, runs = EpisodeBatch.seeded(task, 6, 0), range(6)
     for request in requests(task, 6, 10, rate=0.8):
         signals = batch.signals()
@@ -131,9 +127,7 @@ def test_equal_discrepancies_follow_the_queue() -> None:
 def test_a_sensor_that_does_not_learn_of_losses_competes_by_what_it_sent() -> None:
     """Its discrepancy is that of its own last packet, lost or not."""
     lossy = {"channel": "independent", "drop_probability": 0.5, "acknowledgements": "none"}
-    task = task_of(
-        "RemoteEstimation", sensors=3, access="try_once_discard", discrepancy="held", **lossy
-    )
+    task = task_of("RemoteEstimation", sensors=3, **lossy | HELD)
     batch, sent, apart = EpisodeBatch.seeded(task, 40, 0), np.zeros((3, 40)), 0
     everyone = np.ones((3, 40), dtype=np.bool_)
     for _ in range(30):
@@ -146,6 +140,8 @@ def test_a_sensor_that_does_not_learn_of_losses_competes_by_what_it_sent() -> No
     assert apart
 
 
+TURNS, INNOVATION = {"access": "round_robin"}, {"access": "try_once_discard"}
+HELD = INNOVATION | {"discrepancy": "held"}
 # Mean squared errors of round robin and of both discrepancies at one packet a step.
 ROWS = {
     "BiasedTracking": (1.591, 1.668, 1.368),
@@ -155,24 +151,12 @@ ROWS = {
 }
 
 
-def access_row(name: str, episodes: int) -> list[EpisodeResults]:
-    """The results of round robin and of both discrepancies on the same noise."""
-    results = []
-    for options in (
-        {"access": "round_robin"},
-        {"access": "try_once_discard", "discrepancy": "held"},
-        {"access": "try_once_discard"},
-    ):
-        more = {"filter": "adf"} if name == "BiasedOscillator" else {}
-        task = task_of(name, **options | more)
-        results.append(run_episodes(task, make_policy("always", task), episodes))
-    return results
-
-
 @pytest.mark.parametrize("name", ROWS)
 def test_try_once_discard_has_its_errors_at_equal_rate(name: str) -> None:
     """And an innovation says more than a difference from the held value."""
-    results = access_row(name, 300)
+    more = {"filter": "adf"} if name == "BiasedOscillator" else {}
+    tasks = [task_of(name, **options | more) for options in (TURNS, HELD, INNOVATION)]
+    results = [run_episodes(task, make_policy("always", task), 300) for task in tasks]
     means = [item.mse.mean() for item in results]
     errors = [item.mse.std() / 300**0.5 for item in results]
     rates = [item.rate.mean() for item in results]
@@ -194,7 +178,7 @@ COLLISION = {"access": "collision", "channels": 2, "channel": "independent"}
 CHANNELS = np.array([[2], [1], [2]])  # asked for by number, or left to the network
 BACKEND_CASES: list[tuple[str, dict[str, Any], Any]] = [
     *((name, {"access": "slots", "slots": 2}, None) for name in NAMES),
-    *((name, {"access": "try_once_discard"}, None) for name in NAMES),
+    *((name, INNOVATION, None) for name in NAMES),
     *((name, COLLISION, None) for name in NAMES),
     *((NAMES[1], options, asked) for options in (LOSSY, FADING) for asked in (None, CHANNELS)),
 ]
@@ -217,8 +201,7 @@ def test_access_of_a_backend_is_that_of_numpy(
         np.testing.assert_allclose(*(outcome.error for outcome in outcomes), atol=1e-12)
         np.testing.assert_allclose(*(batch.observe() for batch in batches), atol=1e-6)
     if options["access"] == "assignment":
-        with pytest.raises(ConfigurationError, match="channels from 1 to 2"):
-            batches[1].step(np.full((3, 4), 3))
+        refused(lambda: batches[1].step(np.full((3, 4), 3)), "channels from 1 to 2")
 
 
 def test_simulations_compare_discrepancies_from_their_first_step() -> None:

@@ -1,6 +1,7 @@
 """A model file is data: what is rebuilt from it decides as it did, and nothing in it runs."""
 
 import base64
+import functools
 import io
 import json
 import pickle
@@ -41,35 +42,30 @@ class Saved(NamedTuple):
     carded: Path
 
 
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Saved]:
-    """New models by name, saved by plain Stable-Baselines3 and with our card, each made once."""
-    folder, done = tmp_path_factory.mktemp("models"), {}
+Models = Callable[[str], Saved]
 
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Models:
+    """New models by name, saved by plain Stable-Baselines3 and with our card, each made once."""
+    folder = tmp_path_factory.mktemp("models")
+
+    @functools.cache
     def get(name: str) -> Saved:
-        if name not in done:
-            model, task = MODELS[name].build()
-            if isinstance(model, DQN):
-                model.exploration_rate = 0.5  # a coin that decisions by chance throw
-            plain, carded = folder / f"{name}_plain.zip", folder / f"{name}.zip"
-            model.save(plain)
-            tag_model(model, task)
-            model.save(carded)
-            done[name] = Saved(model, task, plain, carded)
-        return done[name]
+        model, task = MODELS[name].build()
+        if isinstance(model, DQN):
+            model.exploration_rate = 0.5  # a coin that decisions by chance throw
+        plain, carded = folder / f"{name}_plain.zip", folder / f"{name}.zip"
+        model.save(plain)
+        tag_model(model, task)
+        model.save(carded)
+        return Saved(model, task, plain, carded)
 
     return get
 
 
 def refused_agent(path: Path | str, task: Task, *parts: str) -> None:
     refused(lambda: make_policy(f"model:{path}", task), *parts)
-
-
-class ForbiddenUnpickler(pickle.Unpickler):
-    """Reads nothing."""
-
-    def load(self) -> Any:
-        raise AssertionError("something was unpickled")
 
 
 @pytest.fixture
@@ -82,7 +78,9 @@ def no_unpickling(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (pickle, cloudpickle):
         for name in ("load", "loads"):
             monkeypatch.setattr(module, name, forbidden)
-    monkeypatch.setattr(pickle, "Unpickler", ForbiddenUnpickler)
+    monkeypatch.setattr(
+        pickle, "Unpickler", type("Reader", (pickle.Unpickler,), {"load": forbidden})
+    )
     monkeypatch.setattr(save_util, "json_to_data", forbidden)
     monkeypatch.setattr(base64, "b64decode", forbidden)
 
@@ -102,12 +100,16 @@ def decisions(policy: Any, task: Task) -> list[Any]:
     return result
 
 
+def same_weights(model: Any, other: Any) -> None:
+    expected, result = model.policy.state_dict(), other.policy.state_dict()
+    assert expected.keys() == result.keys()
+    assert all(torch.equal(weight, result[key]) for key, weight in expected.items())
+
+
 @pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
 @pytest.mark.parametrize("name", [n for n, of in MODELS.items() if "local" not in of.options])
 @pytest.mark.usefixtures("no_unpickling")
-def test_a_rebuilt_policy_decides_as_the_model_did(
-    saved: Callable[[str], Saved], name: str, carded: bool
-) -> None:
+def test_a_rebuilt_policy_decides_as_the_model_did(saved: Models, name: str, carded: bool) -> None:
     """The same weights, decisions and chances, and torch's and NumPy's random numbers stay."""
     agent = saved(name)
     path = agent.carded if carded else agent.plain
@@ -115,25 +117,19 @@ def test_a_rebuilt_policy_decides_as_the_model_did(
     policy: Any = make_policy(f"model:{path}", agent.task)
     assert streams() == before
     assert type(policy.model) is type(agent.model)
-    expected, result = agent.model.policy.state_dict(), policy.model.policy.state_dict()
-    assert expected.keys() == result.keys()
-    assert all(torch.equal(weight, result[key]) for key, weight in expected.items())
+    same_weights(agent.model, policy.model)
     chance: Any = make_policy(f"model:{path},deterministic=false", agent.task)
     for item in (policy, chance):
         other: Any = make_policy(f"model:{path}", agent.task)
         other.model, other.deterministic = agent.model, item.deterministic
-        first, second = decisions(item, agent.task), decisions(other, agent.task)
-        np.testing.assert_array_equal(first, second)
+        np.testing.assert_array_equal(*(decisions(each, agent.task) for each in (item, other)))
     assert 0.0 < np.mean(decisions(policy, agent.task)) < 1.0
 
 
-def test_the_file_with_a_card_is_an_ordinary_one(saved: Callable[[str], Saved]) -> None:
+def test_the_file_with_a_card_is_an_ordinary_one(saved: Models) -> None:
     agent = saved("ppo_discrete")
     again = PPO.load(agent.carded, device="cpu")
-    assert all(
-        torch.equal(weight, again.policy.state_dict()[name])
-        for name, weight in agent.model.policy.state_dict().items()
-    )
+    same_weights(agent.model, again)
     card_entry = again.fusion_gym_model
     assert card_entry["network"] == {"pi": [8], "vf": [6, 5]}
     assert (card_entry["activation"], card_entry["actions"]) == ("relu", "Discrete(8)")
@@ -190,7 +186,7 @@ def poisoned(data: dict[str, Any], payload: Payload) -> bytes:
 )
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch.jit, which attackers still have
 def test_a_crafted_file_runs_nothing(
-    saved: Callable[[str], Saved], tmp_path: Path, part: str, carded: bool
+    saved: Models, tmp_path: Path, part: str, carded: bool
 ) -> None:
     agent, mark = saved("ppo"), tmp_path / "mark"
     source, payload = agent.carded if carded else agent.plain, Payload(mark)
@@ -207,11 +203,8 @@ def test_a_crafted_file_runs_nothing(
     }
     path = repacked(tmp_path / "crafted.zip", source, **parts[part])
     if part in ("data", "variables", "optimizer"):
-        policy = make_policy(f"model:{path}", agent.task)
-        assert np.array_equal(
-            decisions(policy, agent.task),
-            decisions(make_policy(f"model:{source}", agent.task), agent.task),
-        )
+        same = (make_policy(f"model:{file}", agent.task) for file in (path, source))
+        np.testing.assert_array_equal(*(decisions(policy, agent.task) for policy in same))
     else:
         refused_agent(path, agent.task, "--trust")
     refused_agent(f"{path},trust=true", agent.task, "unknown parameter")
@@ -272,10 +265,11 @@ Parts = Callable[[Saved], tuple[Path, dict[str, bytes]]]
 
 def weights(change: Callable[[dict[Any, Any]], Any]) -> Parts:
     """Other weights, in a file without a card."""
-    return lambda agent: (
-        agent.plain,
-        {"policy__pth": dumped(change(dict(agent.model.policy.state_dict())))},
-    )
+
+    def parts(agent: Saved) -> tuple[Path, dict[str, bytes]]:
+        return agent.plain, {"policy__pth": dumped(change(agent.model.policy.state_dict()))}
+
+    return parts
 
 
 def card(**entries: Any) -> Parts:
@@ -325,7 +319,7 @@ REFUSED: dict[str, tuple[Parts, str]] = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_weights_and_cards_of_no_such_policy_are_refused(
-    saved: Callable[[str], Saved], tmp_path: Path, name: str
+    saved: Models, tmp_path: Path, name: str
 ) -> None:
     make, reason = REFUSED[name]
     source, parts = make(saved("ppo"))
@@ -333,7 +327,7 @@ def test_weights_and_cards_of_no_such_policy_are_refused(
     refused_agent(path, saved("ppo").task, reason)
 
 
-def test_files_that_hold_no_fitting_agent(saved: Callable[[str], Saved], tmp_path: Path) -> None:
+def test_files_that_hold_no_fitting_agent(saved: Models, tmp_path: Path) -> None:
     agent, text, empty = saved("ppo"), tmp_path / "notes.zip", tmp_path / "empty.zip"
     text.write_text("no model")
     with zipfile.ZipFile(empty, "w") as packed:
@@ -350,16 +344,14 @@ def test_files_that_hold_no_fitting_agent(saved: Callable[[str], Saved], tmp_pat
 
 
 def test_parts_larger_than_any_model_are_not_read(
-    saved: Callable[[str], Saved], monkeypatch: pytest.MonkeyPatch
+    saved: Models, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent = saved("ppo")
     monkeypatch.setattr(archive, "LARGEST", 10_000)
     refused_agent(agent.plain, agent.task, "its data has ", " bytes, more than 10000")
 
 
-def test_a_damaged_file_is_refused_or_harmless(
-    saved: Callable[[str], Saved], tmp_path: Path
-) -> None:
+def test_a_damaged_file_is_refused_or_harmless(saved: Models, tmp_path: Path) -> None:
     """Cut short, or with bytes changed: one line, or a policy."""
     agent, path, stream = saved("ppo"), tmp_path / "damaged.zip", random.Random(0)
     whole = agent.carded.read_bytes()
@@ -413,7 +405,7 @@ def test_commands_load_foreign_code_with_trust_alone(tmp_path: Path) -> None:
         succeed(command, [*words, "--trust"])
 
 
-def test_evaluate_says_where_drawn_actions_do_otherwise(saved: Callable[[str], Saved]) -> None:
+def test_evaluate_says_where_drawn_actions_do_otherwise(saved: Models) -> None:
     agent, rule = f"model:{saved('ppo').carded}", "innovation_threshold"
     words = ["--env", ENV, "--set", "filter=tobit", "horizon=20", "--episodes", "40", "--policies"]
     message = f"{agent},deterministic=false evaluates them"

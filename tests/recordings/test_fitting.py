@@ -20,7 +20,6 @@ from fusion_gym.recordings.fitting import (
     residual_correlations,
     warnings_of,
 )
-from fusion_gym.validation import ConfigurationError
 
 A = np.array([[0.92, 0.05, 0.0], [0.04, 0.9, 0.05], [0.0, 0.06, 0.93]])
 W = np.array([[1.0, 0.2, 0.0], [0.2, 0.8, 0.1], [0.0, 0.1, 0.5]])
@@ -39,9 +38,7 @@ def simulate(rows: int, seed: int = 0, second: NDArray[np.float64] | None = None
 def recording(values: np.ndarray, every: str = "1min") -> Recording:
     index = pd.date_range("2026-01-01", periods=len(values), freq=every)
     names = [f"c{place}" for place in range(values.shape[1])]
-    return Recording(
-        pd.DataFrame(values, index=index, columns=names), tuple(map(RecordedChannel, names))
-    )
+    return Recording(pd.DataFrame(values, index, names), tuple(map(RecordedChannel, names)))
 
 
 def test_least_squares_finds_the_plant_within_its_intervals() -> None:
@@ -144,9 +141,8 @@ def test_an_explosive_fit_is_damped_and_has_the_residuals_of_its_regression() ->
 def test_changes_and_weights_have_a_closed_form() -> None:
     """Two channels x' = a x + w: a change in ten steps has variance 2 P (1 - a^10)."""
     a, variance = np.array([0.9, 0.5]), np.array([4.0, 9.0])
-    plant = FittedPlant(
-        ("a", "b"), np.diag(a), np.diag(variance * (1.0 - a**2)), np.full(2, 1e-6), 1
-    )
+    process = np.diag(variance * (1.0 - a**2))
+    plant = FittedPlant(("a", "b"), np.diag(a), process, np.full(2, 1e-6), 1)
     assert plant.typical_changes == pytest.approx(np.sqrt(2.0 * variance * (1.0 - a**10)))
     assert plant.options["state_weights"] == pytest.approx(1.0 / variance / 2.0)
 
@@ -252,8 +248,7 @@ def test_a_channel_may_be_silent_for_long(exact: bool) -> None:
     plant = fit(recording(path), exact=exact, order=1)
     assert plant.transition == pytest.approx(A, abs=0.08)
     path[150:4000, 1] = np.nan
-    with pytest.raises(ConfigurationError, match="readings of c1 in the fitted part = 150 "):
-        fit(recording(path), exact=exact)
+    refused(lambda: fit(recording(path), exact=exact), "readings of c1 in the fitted part = 150 ")
 
 
 def test_exact_readings_in_coarse_steps_have_no_noise() -> None:

@@ -91,10 +91,7 @@ REFUSED = {
     "one time for all": (log(time="2026-01-01 10:00"), "all its rows have the same time"),
     "a clock that jumps to 1970": (with_cell(0, 0, "1970-01-01 00:00:00"), "look for a wrong time"),
     "a clock that jumps to 2199": (with_cell(59, 0, "2199-01-01 00:00:00"), "look for a wrong"),
-    "two channels of one name": (
-        TEXT.replace("b [m]", "a [K]"),
-        "its channels are ['a', 'a', 'c']",
-    ),
+    "two channels of one name": (TEXT.replace("b [m]", "a [K]"), "channels are ['a', 'a', 'c']"),
     "no numbers": (log()[["time"]].assign(a=np.nan, b="on", c=1e200), "channel 'a' has no number"),
     **{
         f"the head {head}": (TEXT.replace("b [m]", head), f"the head {head!r} must be")
@@ -109,9 +106,7 @@ REFUSED = {
     "a line without an end": ("x" * 200_000, "field larger than field limit"),
     "numbers without a unit": (log(time=np.arange(60)), "numbers a unit in the head"),
     "a long log of many channels": (
-        pd.DataFrame(
-            {"time": [*log()["time"]] * 101, "name": np.repeat(np.arange(101), 60), "value": 1.0}
-        ),
+        pd.concat([log(2)[["time"]].assign(name=name, value=1.0) for name in range(101)]),
         "has 101 channels and 0 readings at the time of another; export",
     ),
     "no heads": ("\n".join(TEXT.splitlines()[1:]), "its heads are numbers, such as"),
@@ -205,31 +200,24 @@ def test_a_log_without_a_plant_makes_no_file(tmp_path: Path) -> None:
 
 def test_a_head_without_a_unit_has_limits(tmp_path: Path) -> None:
     recording = read(TEXT.replace("a [m]", "a b -.5..2").replace("b [m]", "b ..3"), tmp_path)
-    assert recording.channels[:2] == (
-        RecordedChannel("a b", low=-0.5, high=2.0),
-        RecordedChannel("b", high=3.0),
-    )
+    low, high = RecordedChannel("a b", low=-0.5, high=2.0), RecordedChannel("b", high=3.0)
+    assert recording.channels[:2] == (low, high)
 
 
+BACK = [*log()["time"][:30], *log()["time"][24:54]]
 REMARKED = {
     "unsorted": (shuffled(log()), "times before the row above: sorted"),
-    "a clock set back": (
-        log(time=pd.concat([log()["time"][:30], log()["time"][24:54]]).to_list()),
-        "6 rows at the time of another",
-    ),
+    "a clock set back": (log(time=BACK), "6 rows at the time of another"),
     "times of two precisions": (with_cell(3, 0, "2026-03-01 00:31"), "1 times between"),
-    "a word for no reading": (with_cell(3, 1, "off"), "1 cells without a finite number"),
     "rows twice": (pd.concat([log(), log()]), "60 rows at the time of another"),
     "rows beside the even times": (with_cell(7, 0, "2026-03-01 01:14:00"), "1 times between"),
-    "text in a cell": (with_cell(3, 1, "ERR"), "1 cells without a finite number"),
-    "infinity in a cell": (with_cell(3, 1, "inf"), "1 cells without a finite number"),
-    "a column of words": (log(d="on"), "column 'd' has no numbers: left out"),
-    "an empty column": (log(d=np.nan), "column 'd' has no numbers: left out"),
-    "a column of huge numbers": (log(d=1e200), "column 'd' has no numbers: left out"),
-    "a column of infinities": (log(d=np.inf), "column 'd' has no numbers: left out"),
+    **{f"{text} in a cell": (with_cell(3, 1, text), "1 cells without a finite number")
+       for text in ("off", "ERR", "inf")},
+    **{f"a column of {d}": (log(d=d), "column 'd' has no numbers: left out")
+       for d in ("on", np.nan, 1e200, np.inf)},
     "a row without a time": (with_cell(3, 0, ""), "1 rows without a time: left out"),
     "a row with a broken time": (with_cell(3, 0, "2026-13-45"), "1 rows without a time"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", REMARKED)
@@ -464,10 +452,8 @@ def test_a_limit_is_no_error_code_and_a_given_code_is(tmp_path: Path) -> None:
     values[7] = -1.25
     read(pd.DataFrame({"time": clock("%Y-%m-%d %H:%M", 4000), "a": values}), tmp_path)
     recording = Recording.read(tmp_path / "log.csv", error_codes=[-1.25, 77.0])
-    assert recording.remarks == (
-        "a: 1 readings of -1.25 are an error code: no reading",
-        "no reading is the error code 77",
-    )
+    hit = "a: 1 readings of -1.25 are an error code: no reading"
+    assert recording.remarks == (hit, "no reading is the error code 77")
     assert (recording.values["a"] == 35.0).sum() > 100
 
 
@@ -522,8 +508,7 @@ def test_silence_of_a_log_on_change_is_no_missing_reading(size: float, tmp_path:
     recording = Recording.read(tmp_path / "log.csv")
     assert recording.interval == pd.Timedelta("1min")
     assert recording.card[0].change == pytest.approx(size, rel=0.1)
-    with pytest.raises(ConfigurationError, match=r"recorded on change.*--on-change"):
-        fit(recording.select())
+    refused(lambda: fit(recording.select()), "recorded on change", "--on-change")
     held = recording.select().hold()
     assert fit(held, order=1).transition.item() == pytest.approx(0.63, abs=0.05)
     assert "the last reading" in held.remarks[-1]
