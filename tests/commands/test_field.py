@@ -236,7 +236,7 @@ def test_a_log_on_change_with_a_date_format_is_studied(room: list[str], tmp_path
     output, form = tmp_path / "field", ["--date-format", "%d.%m.%Y %Hh%M"]
     for rows, words, message in (
         (2400, form, "give --on-change"),
-        (2400, ["--on-change"], "(--date-format)"),
+        (2400, ["--on-change"], "--date-format"),
         (300, [*form, "--on-change", "--share", "0.95"], "horizon = 20"),
     ):
         held[:rows].to_csv(room[0])
