@@ -41,30 +41,26 @@ def diagonal(covariance: Array) -> Array:
     return np.einsum("iin->in", covariance)
 
 
+def difference(entries: Array, constant: Any, signals: Signals) -> tuple[Array, Array]:
+    return entries * constant, signals["measurement"] - signals["held"]
+
+
 # For each word of a constant and block what the entries stand for, from signals.
 PHYSICAL: dict[tuple[str, str], Any] = {
     ("estimate", "root mean square"): lambda e, c, s: (e * c, s["prior_mean"]),
-    ("log_variance", "open-loop mean"): (
-        lambda e, c, s: (np.exp(e) * c, diagonal(s["prior_covariance"]))
-    ),
-    ("log_deviation", "open-loop deviation"): (
-        lambda e, c, s: (np.exp(e) * c, np.sqrt(diagonal(s["prior_covariance"])))
-    ),
-    ("held_difference", "two noise deviations"): (
-        lambda e, c, s: (e * c, s["measurement"] - s["held"])
-    ),
-    ("held_difference", "√2 noise deviations"): (
-        lambda e, c, s: (e * c, s["measurement"] - s["held"])
-    ),
+    ("log_variance", "open-loop mean"):
+        lambda e, c, s: (np.exp(e) * c, diagonal(s["prior_covariance"])),
+    ("log_deviation", "open-loop deviation"):
+        lambda e, c, s: (np.exp(e) * c, np.sqrt(diagonal(s["prior_covariance"]))),
+    ("held_difference", "two noise deviations"): difference,
+    ("held_difference", "√2 noise deviations"): difference,
     ("error", "error_scale"): lambda e, c, s: (e * c, s["innovation"][:, 0]),
-    ("belief_difference", "nominal deviations"): (
-        lambda e, c, s: (np.sinh(e) / 4.0 * c, s["belief_difference"])
-    ),
+    ("belief_difference", "nominal deviations"):
+        lambda e, c, s: (np.sinh(e) / 4.0 * c, s["belief_difference"]),
     ("tokens", "capacity"): lambda e, c, s: (e * c, s["tokens"]),
-    ("transmission_value", "nominal error"): (
-        lambda e, c, s: (np.sign(e[1:]) * (e[1:] / 2.0) ** 2 * c, s["transmission_value"])
-    ),
-}
+    ("transmission_value", "nominal error"):
+        lambda e, c, s: (np.sign(e[1:]) * (e[1:] / 2.0) ** 2 * c, s["transmission_value"]),
+}  # fmt: skip
 
 
 LAST = ("fusion_gym/UnknownInput-v1", "log_deviation", "open-loop deviation")
@@ -83,10 +79,8 @@ def check(batch: EpisodeBatch, env_id: str) -> set[tuple[str, str]]:
             size = min(len(ours), len(theirs))  # an input stands behind the states
             ours, theirs = ours[:size], theirs[:size]
             observed = np.isfinite(ours)
-            np.testing.assert_allclose(
-                ours[observed], np.broadcast_to(theirs, ours.shape)[observed], rtol=2e-5, atol=2e-5,
-                err_msg=f"{env_id}: {name}",
-            )  # fmt: skip
+            theirs = np.broadcast_to(theirs, ours.shape)[observed]
+            np.testing.assert_allclose(ours[observed], theirs, rtol=2e-5, atol=2e-5, err_msg=name)
             if observed.any():
                 done.add((name, word))
     return done

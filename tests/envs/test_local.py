@@ -14,7 +14,6 @@ from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"
@@ -59,8 +58,6 @@ def test_without_its_number_a_row_is_the_same_but_for_that(env_id: str) -> None:
     assert other.space.shape == (stored,)
     rows, fewer = view.rows(batch.observe()), other.rows(batch.observe())
     np.testing.assert_array_equal(rows[:, :stored], fewer, strict=True)
-    with pytest.raises(ConfigurationError, match="own_number = 1 "):
-        fusion_gym.make_task(env_id, own_number=1)
 
 
 def test_a_shared_policy_is_trained_saved_and_evaluated(tmp_path: Path) -> None:

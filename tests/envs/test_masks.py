@@ -21,8 +21,7 @@ BIASED = "fusion_gym/BiasedOscillator-v1"
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"action": "multidiscrete"}, {"action": "discrete"}, {"access": "single"}],
+    "options", [{}, {"action": "multidiscrete"}, {"action": "discrete"}, {"access": "single"}]
 )
 def test_masks_close_exactly_the_actions_with_closed_sensors(options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(ENV_ID, **options)
@@ -40,14 +39,9 @@ def test_masks_close_exactly_the_actions_with_closed_sensors(options: dict[str, 
 
 @pytest.mark.parametrize("env_id", [ENV_ID, BIASED])
 def test_a_masked_agent_is_never_denied(env_id: str, tmp_path: Any) -> None:
-    options: dict[str, Any] = {
-        "tokens": "limited",
-        "token_rate": 1.0,
-        "sharing": "fixed",
-        "token_capacity": 9.0,
-    }
-    options["initial_tokens"] = 6.0
-    task = fusion_gym.make_task(env_id, access="single", horizon=40, **options)
+    options: Any = {"tokens": "limited", "sharing": "fixed", "access": "single", "horizon": 40}
+    amounts = {"token_rate": 1.0, "token_capacity": 9.0, "initial_tokens": 6.0}
+    task = fusion_gym.make_task(env_id, **options, **amounts)
     env = FusionSB3VecEnv(task, 4)
     assert is_masking_supported(env)
     env.reset()

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeAwareObservation
 from pettingzoo.test.state_test import test_parallel_env as pettingzoos_check_of_states
 
 import fusion_gym
@@ -84,17 +85,6 @@ def test_what_runs_do_not_have_is_refused() -> None:
         envs.set_attr("token_rate", [1.0, 2.0, 3.0])
 
 
-def test_pictures_of_runs_by_call() -> None:
-    assert vector("vector_entry_point").call("render") == (None, None, None)
-    envs = vector("vector_entry_point", 2, render_mode="rgb_array")
-    envs.reset(seed=0)
-    for _ in range(3):
-        envs.step(np.ones((2, 3), dtype=np.int8))
-    first, second = envs.call("render")
-    assert first.shape == second.shape
-    assert not np.array_equal(first, second)
-
-
 @pytest.mark.parametrize(
     ("env_id", "options"),
     [
@@ -151,15 +141,51 @@ def test_a_copy_goes_on_alike(kind: str) -> None:
         assert set(rest) == {first}
 
 
-def test_a_specification_survives_a_file() -> None:
-    env = gym.make(TOBIT, horizon=11, filter="tobit", token_rate=1.5)
-    assert env.spec is not None
-    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.spec is not None
-    assert again.spec.max_episode_steps == 11
-    first = again.reset(seed=2)[0], again.step(np.ones(3, dtype=np.int8))[0]
-    second = env.reset(seed=2)[0], env.step(np.ones(3, dtype=np.int8))[0]
-    np.testing.assert_array_equal(first, second)
+@pytest.mark.parametrize("horizon", [7, 130])
+def test_the_specification_knows_the_horizon(horizon: int) -> None:
+    """And survives a file."""
+    options = {"horizon": horizon, "filter": "tobit"}
+    env = gym.make(TOBIT, **options)
+    spec: Any = env.spec
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json()))
+    first, other = (each.reset(seed=2)[0] for each in (env, again))
+    np.testing.assert_array_equal(first, other)
+    native = vector("vector_entry_point", **options)
+    assert {each.spec.max_episode_steps for each in (env, again, native)} == {horizon}
+    aware = TimeAwareObservation(env)
+    for each, steps in (
+        *((env, horizon), (again, horizon), (gym.make(spec), horizon), (aware, horizon)),
+        (gym.make(TOBIT, max_episode_steps=5, **options), 5),
+    ):
+        assert steps_of(each) == steps
+    before, _ = aware.reset(seed=0)
+    after = aware.step(np.zeros(3, dtype=np.int8))[0]
+    assert aware.observation_space.contains(after)
+    assert after[-1] > before[-1]
+
+
+def steps_of(env: Any) -> int:
+    env.reset(seed=0)
+    count, over = 0, False
+    while not over:
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        over, count = terminated or truncated, count + 1
+    return count
+
+
+def test_a_vector_of_rewards_sums_to_the_reward() -> None:
+    options: dict[str, Any] = {"filter": "tobit", "horizon": 6, "cost_weight": 0.3}
+    env: Any = gym.make(TOBIT, reward="vector", disable_env_checker=True, **options)
+    plain = gym.make(TOBIT, **options)
+    env.reset(seed=3)
+    plain.reset(seed=3)
+    assert env.unwrapped.reward_space.shape == (2,)
+    for _ in range(6):
+        action = plain.action_space.sample()
+        _, pair, _, _, info = env.step(action)
+        assert env.unwrapped.reward_space.contains(pair)
+        assert pair.sum() == pytest.approx(plain.step(action)[1])
+        assert pair.tolist() == [info["reward_error"], info["reward_cost"]]
 
 
 def test_a_child_process_finds_an_id_with_its_module() -> None:

@@ -29,8 +29,7 @@ def draw_actions(steps: int, num_envs: int) -> NDArray[np.int64]:
 def scribble(value: Any) -> None:
     """Overwrite everything in what an environment returned."""
     if isinstance(value, dict):
-        for entry in value.values():
-            scribble(entry)
+        scribble(list(value.values()))
         value["scribble"] = True
     elif isinstance(value, (list, tuple)):
         for entry in value:
@@ -38,10 +37,8 @@ def scribble(value: Any) -> None:
     elif isinstance(value, np.ndarray):
         if value.dtype == object:
             scribble(value.tolist())
-        elif value.dtype == np.bool_:
-            np.logical_not(value, out=value)
         else:
-            value.fill(77)
+            value[...] = ~value if value.dtype == np.bool_ else 77
 
 
 def text_of(value: Any) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.task import Task
@@ -76,9 +77,8 @@ def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
         squared_error.append(rows.pop("squared_error"))
         for name, row in rows.items():
             expected = np.sum(row, 0) if name == "returns" else np.mean(row, 0)
-            np.testing.assert_allclose(
-                getattr(results, name)[episode], expected, rtol=1e-9, err_msg=name
-            )
+            value = getattr(results, name)[episode]
+            np.testing.assert_allclose(value, expected, rtol=1e-9, err_msg=name)
     np.testing.assert_allclose(results.squared_error, np.mean(squared_error, 0), rtol=1e-9)
     np.testing.assert_allclose(results.tokens, results.rate @ [3.0, 2.0, 1.0])
     assert results.episodes == 5
@@ -93,9 +93,8 @@ def test_results_do_not_depend_on_how_episodes_are_batched(
     parts = run_episodes(task, make_policy("send_on_delta", task), 11, 10, steps.append)
     assert sum(steps) == 11 * 12
     for field in fields(EpisodeResults):
-        np.testing.assert_allclose(
-            getattr(parts, field.name), getattr(whole, field.name), rtol=1e-9, atol=1e-12
-        )
+        part, expected = (getattr(results, field.name) for results in (parts, whole))
+        np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-12)
     assert not np.allclose(evaluate(task, "send_on_delta", 11, seed=500).mse, whole.mse)
 
 
@@ -151,17 +150,14 @@ def test_interval_covers_the_mean_19_times_in_20(law: str) -> None:
     assert hits / 400 == pytest.approx(0.94 if law == "normal" else 0.92, abs=0.035)
 
 
-@pytest.mark.parametrize("samples", [[3.5], [2.0, 2.0, 2.0], [0.0] * 50], ids=str)
-def test_interval_of_samples_without_spread(samples: list[float]) -> None:
-    assert mean_interval(np.array(samples)) == (samples[0], samples[0], samples[0])
-
-
 def test_interval_is_reproducible_and_narrows() -> None:
     samples = np.random.default_rng(0).normal(size=1600)
     few, many = mean_interval(samples[:100]), mean_interval(samples)
     assert mean_interval(samples) == many
     ratio = (few.high - few.low) / (many.high - many.low)
     assert ratio == pytest.approx(4.0, rel=0.25)
+    for same in ([3.5], [2.0, 2.0, 2.0], [0.0] * 50):
+        assert mean_interval(np.array(same)) == (same[0],) * 3
 
 
 def test_pairing_removes_the_noise_that_policies_share(task: Task) -> None:
@@ -172,8 +168,7 @@ def test_pairing_removes_the_noise_that_policies_share(task: Task) -> None:
     assert paired.mean == pytest.approx(np.mean(results.mse - other.mse))
     assert (paired.high - paired.low) < 0.5 * (unpaired.high - unpaired.low)
     assert paired_difference(results, results) == (0.0, 0.0, 0.0)
-    with pytest.raises(ConfigurationError, match="episodes = 300 and 5"):
-        paired_difference(results, evaluate(task, "never", 5))
+    refused(lambda: paired_difference(results, evaluate(task, "never", 5)), "episodes = 300 and 5")
 
 
 clouds = st.lists(st.tuples(st.integers(0, 20), st.integers(1, 40)), min_size=1, max_size=12).map(
@@ -215,8 +210,7 @@ def test_comparison_mixes_episode_by_episode(
     hull = lower_envelope(baselines)
     policy = fake(2.0 + noise[12], rate / 20)
     if rate / 20 < hull[0].rate - 1e-12:
-        with pytest.raises(ConfigurationError, match="below every baseline"):
-            compare_with_envelope(policy, baselines)
+        refused(lambda: compare_with_envelope(policy, baselines), "below every baseline")
         return
     result = compare_with_envelope(policy, baselines)
     expected = envelope_at(hull, rate / 20)
@@ -227,14 +221,9 @@ def test_comparison_mixes_episode_by_episode(
 
 
 def test_envelope_by_hand() -> None:
-    baselines = {
-        "never": fake([8.0, 4.0], 0.0),
-        "inside": fake([5.0, 5.5], 0.2),
-        "good": fake([3.0, 1.0], 0.4),
-        "worse": fake([3.0, 3.0], 0.6),
-        "always": fake([1.0, 1.0], 1.0),
-        "wasteful": fake([1.5, 1.5], 1.0),
-    }
+    baselines = {"never": fake([8.0, 4.0], 0.0), "inside": fake([5.0, 5.5], 0.2)}
+    baselines |= {"good": fake([3.0, 1.0], 0.4), "worse": fake([3.0, 3.0], 0.6)}
+    baselines |= {"always": fake([1.0, 1.0], 1.0), "wasteful": fake([1.5, 1.5], 1.0)}
     hull = lower_envelope(baselines)
     assert [point.name for point in hull] == ["never", "good", "always"]
     # At a rate of 0.1 three quarters never and one quarter good: 6.75 and 3.25
@@ -248,10 +237,8 @@ def test_envelope_by_hand() -> None:
     assert result.difference == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
     with pytest.raises(ConfigurationError, match="add 'never'"):
         compare_with_envelope(fake([1.0, 1.0], 0.1), {"always": baselines["always"]})
-    with pytest.raises(ConfigurationError, match="paired"):
-        compare_with_envelope(fake([1.0, 1.0, 1.0], 0.4), baselines)
-    with pytest.raises(ConfigurationError, match="at least one"):
-        lower_envelope({})
+    refused(lambda: compare_with_envelope(fake([1.0, 1.0, 1.0], 0.4), baselines), "paired")
+    refused(lambda: lower_envelope({}), "at least one")
 
 
 def test_the_zoo_the_evaluation_and_the_list_do_without_torch() -> None:

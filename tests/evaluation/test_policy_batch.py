@@ -11,17 +11,15 @@ from fusion_gym.evaluation.episodes import run_episodes, run_several
 from fusion_gym.policies.registry import make_policy
 
 ENV = "fusion_gym/TobitOscillator-v1"
+VALUE, OWN = "value_of_information", "estimate_difference:own=true"
 
 
 @pytest.mark.parametrize(
     ("options", "policies"),
     [
         ({}, ["innovation_threshold:threshold=0.5", "stochastic_event:weight=2", "always"]),
-        ({"memory": True}, ["value_of_information:threshold=0.01", "value_of_information"]),
-        (
-            {"memory": True},
-            ["estimate_difference:own=true", "estimate_difference:own=true,whitened=true"],
-        ),
+        ({"memory": True}, [f"{VALUE}:threshold=0.01", VALUE]),
+        ({"memory": True}, [OWN, f"{OWN},whitened=true"]),
     ],
 )
 def test_policies_beside_each_other_do_what_each_does_alone(

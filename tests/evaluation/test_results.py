@@ -44,15 +44,11 @@ def test_no_error_at_all_can_be_compared() -> None:
     """Over a perfect channel whoever always transmits has none: no share of it."""
     task = make_task("fusion_gym/RemoteEstimation-v1", horizon=3)
     results = run_episodes(task, make_policy("always", task), 2, 0)
-    point = Point(
-        "always",
-        1.0,
-        0.0,
-        compare_at_price(results, {"always": results}, 0.0),
-        compare_with_envelope(results, {"always": results}),
-    )
+    every = {"always": results}
+    at_price, at_rate = compare_at_price(results, every, 0.0), compare_with_envelope(results, every)
+    point = Point("always", 1.0, 0.0, at_price, at_rate)
     assert list(rate_table([point]).columns[5].cells) == ["–"]
-    assert list(price_table([point], {"always": results}).columns[6].cells) == ["–"] * 2
+    assert list(price_table([point], every).columns[6].cells) == ["–"] * 2
 
 
 def test_a_rule_is_compared_under_its_name_in_few_curves(

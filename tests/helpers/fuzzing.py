@@ -4,15 +4,17 @@ All that is known of an environment is its dataclass of options (fields, types, 
 its errors say, so that a new one is covered without a change here.
 """
 
+import copy
 import decimal
 import fractions
 import functools
 import math
 import re
 import signal
+import types
 import typing
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
@@ -31,59 +33,24 @@ STEPS, RUNS, SECONDS = 50, 3, 20
 # Settings of hypothesis for tries that take long and are not kept.
 FREE: Options = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
-# What belongs nowhere, made anew for every try.
-_STRANGE: list[Callable[[], Any]] = [
-    lambda: None,
-    lambda: "",
-    lambda: "two\nlines",
-    lambda: "random",
-    lambda: b"bytes",
-    lambda: {},
-    lambda: {"a": 1.0},
-    lambda: set(),
-    list,
-    lambda: [[]],
-    lambda: [[1.0], [1.0, 2.0]],
-    lambda: [None],
-    lambda: ["a", "b"],
+# What belongs nowhere; the functions make what a copy could not be of.
+_STRANGE: tuple[Any, ...] = (
+    None, "", "two\nlines", "random", b"bytes", {}, {"a": 1.0}, set(), [], [[]],
+    [[1.0], [1.0, 2.0]], [None], ["a", "b"],
     lambda: functools.reduce(lambda inner, _: [inner], range(80), 1.0),
-    lambda: [True, False],
-    lambda: memoryview(b"bytes"),
-    lambda: (value for value in (1.0, 2.0)),
+    [True, False],
+    lambda: memoryview(b"bytes"), lambda: (value for value in (1.0, 2.0)),
     lambda: (value := [], value.append(value))[0],
-    lambda: 1 + 2j,
-    lambda: object(),
-    lambda: int,
-    lambda: range(3),
-    lambda: 10**400,
-    lambda: -(10**400),
-    lambda: fractions.Fraction(1, 3),
-    lambda: decimal.Decimal("0.5"),
-    lambda: np.array("word"),
-    lambda: np.array(["word", "other"]),
-    lambda: np.array([None, 1.0]),
-    lambda: np.array(2.0),
-    lambda: np.array(7),
-    lambda: np.array(True),
-    lambda: np.zeros(0),
-    lambda: np.ones((2, 2)),
-    lambda: np.ones((3, 2, 2)),
-    lambda: np.eye(40),
-    lambda: [np.ones((2, 2)), np.ones((2, 2))],
-    lambda: np.linspace(0.0, 1.0, 3000),
-    lambda: np.ma.masked_array([1.0, 2.0], mask=[True, False]),
-    lambda: np.float32(0.3),
-    lambda: np.float16(3.0),
-    lambda: np.longdouble("1e4000"),
-    lambda: np.int64(3),
-    lambda: np.uint8(200),
-    lambda: np.bool_(True),
-    lambda: np.str_("word"),
-    lambda: np.datetime64("2020-01-01"),
-    lambda: np.float64("nan"),
-    lambda: np.array([1.0, np.nan]),
-    lambda: [[1.0, math.inf], [0.0, 1.0]],
-]
+    1 + 2j, object(), int, range(3), 10**400, -(10**400),
+    fractions.Fraction(1, 3), decimal.Decimal("0.5"), np.array("word"),
+    np.array(["word", "other"]), np.array([None, 1.0]), np.array(2.0), np.array(7),
+    np.array(True), np.zeros(0), np.ones((2, 2)), np.ones((3, 2, 2)), np.eye(40),
+    [np.ones((2, 2)), np.ones((2, 2))], np.linspace(0.0, 1.0, 3000),
+    np.ma.masked_array([1.0, 2.0], mask=[True, False]), np.float32(0.3), np.float16(3.0),
+    np.longdouble("1e4000"), np.int64(3), np.uint8(200), np.bool_(True), np.str_("word"),
+    np.datetime64("2020-01-01"), np.float64("nan"), np.array([1.0, np.nan]),
+    [[1.0, math.inf], [0.0, 1.0]],
+)  # fmt: skip
 # 9¹² entries in twelve lists: a reader of options must count before it makes an array of it.
 _EXPANDING = st.builds(lambda: functools.reduce(lambda inner, _: [inner] * 9, range(12), 1.0))
 _EXTREME: tuple[Any, ...] = (
@@ -136,8 +103,12 @@ def _factors() -> st.SearchStrategy[float]:
     return near | near | st.floats(-12.0, 12.0).map(lambda power: 10.0**power)
 
 
+def _fresh(strange: Any) -> Any:
+    return strange() if isinstance(strange, types.FunctionType) else copy.deepcopy(strange)
+
+
 HOSTILE: st.SearchStrategy[Any] = st.one_of(
-    st.sampled_from(_EXTREME), st.sampled_from(_STRANGE).map(lambda make: make()), _magnitudes()
+    st.sampled_from(_EXTREME), st.sampled_from(_STRANGE).map(_fresh), _magnitudes()
 )
 
 

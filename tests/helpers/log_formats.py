@@ -9,10 +9,13 @@ from fusion_gym.recordings import Recording
 
 ZERO = pd.Timestamp("1970-01-01")
 CODES = (-127.0, 85.0, -999.0, -9999.0, 9999.0)
+UNITS = {"unix": 1.0, "time_ms": 1e-3, "elapsed [min]": 60.0, "hours": 3600.0}
+UNITS |= {"excel days": 86400.0}
+ZEROS = {"unix": ZERO, "time_ms": ZERO, "excel days": pd.Timestamp("1899-12-30")}
+PLACES = {"excel days": 12, "time_ms": 3}
 CLOCKS = ("%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y/%m/%d %H:%M:%S.%f",
           "%d/%m/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S.%f",
-          "%m/%d/%Y %I:%M:%S %p", "%d.%m.%y %H:%M:%S.%f",
-          "unix", "time_ms", "elapsed [min]", "hours", "excel days")  # fmt: skip
+          "%m/%d/%Y %I:%M:%S %p", "%d.%m.%y %H:%M:%S.%f", *UNITS)  # fmt: skip
 
 
 @dataclass
@@ -22,14 +25,14 @@ class Drawn:
     text: str
     truth: pd.DataFrame
     wrapped: str | None
-    features: dict[str, object]
+    seconds: float
 
     def verdict(self, recording: Recording) -> str:
         """Return what is wrong with the recording, or an empty text."""
         values, truth = recording.values, self.truth
         if set(values) != set(truth):
             return f"channels {list(values)}"
-        interval = pd.Timedelta(self.features["seconds"], "s")
+        interval = pd.Timedelta(self.seconds, "s")
         if abs(recording.interval - interval) > 1e-3 * interval:
             return f"interval {recording.interval} for {interval}"
         places = values.index.get_indexer(truth.index, method="nearest", tolerance=0.06 * interval)
@@ -80,25 +83,17 @@ def draw_log(seed: int) -> Drawn:
         jitter = 0.0
     late = jitter * draw.random(rows)
     real = even + pd.to_timedelta(np.round(late, 6), "s")
-    passed = (real - start).total_seconds().to_numpy()
     head = "time"
-    if clock in ("unix", "time_ms", "elapsed [min]", "hours", "excel days"):
-        head = clock
-        size_of = {"unix": 1.0, "time_ms": 1e-3, "elapsed [min]": 60.0, "hours": 3600.0,
-                   "excel days": 86400.0}[clock]  # fmt: skip
-        absolute = real - (pd.Timestamp("1899-12-30") if clock == "excel days" else ZERO)
-        own = absolute.total_seconds().to_numpy()
-        own = own if clock in ("unix", "time_ms", "excel days") else passed
-        texts = [f"{x:.{12 if clock == 'excel days' else 9}f}" for x in own / size_of]
-        even = even if clock in ("unix", "time_ms", "excel days") else ZERO + (even - start)
-        if clock == "time_ms":
-            texts = [f"{x:.3f}" for x in own / size_of]
+    if clock in UNITS:
+        head, zero = clock, ZEROS.get(clock, start)
+        even = even if clock in ZEROS else ZERO + (even - start)
+        own = (real - zero).total_seconds().to_numpy() / UNITS[clock]
+        texts = [f"{x:.{PLACES.get(clock, 9)}f}" for x in own]
     else:
         texts = list(real.strftime(clock))
     truth = pd.DataFrame(values, even, names)
-    separator, decimal = [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")][
-        draw.integers(5)
-    ]
+    signs = [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")]
+    separator, decimal = signs[draw.integers(5)]
     thousands = draw.choice(["", "", {".": ",", ",": "."}[decimal], " "])
     unit = draw.choice(["", " °C", " %"]) if layout == "wide" else ""
 
@@ -144,7 +139,4 @@ def draw_log(seed: int) -> Drawn:
         kinds = separator.join(['"Smp"'] * width)
         text = f"{above}{top}\n{units}\n{kinds}\n{body}"
     truth = truth.dropna(how="all")
-    features = {"clock": clock, "layout": layout, "seconds": seconds, "rows": rows, "apart": apart,
-                "separator": separator, "decimal": decimal, "thousands": thousands,
-                "jitter": jitter, "code": code, "quoting": quoting, "unit": unit}  # fmt: skip
-    return Drawn(text, truth, wrapped, features)
+    return Drawn(text, truth, wrapped, seconds)

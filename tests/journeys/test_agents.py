@@ -15,6 +15,7 @@ import pytest
 import yaml
 from command_runs import call, refusal, succeed
 from paths import ROOT
+from refusals import refused
 from training_configs import ENV, read_records, small_config
 
 import fusion_gym
@@ -26,7 +27,6 @@ from fusion_gym.training import run as train
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment, Sweep, SweepSettings
-from fusion_gym.validation import ConfigurationError
 
 CONFIGS = ROOT / "configs"
 EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "\ntraining:" in f.read_text()]
@@ -59,12 +59,12 @@ def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
 
 
 UNREADABLE = {
-    "absent": (None, r"unreadable\.yaml"),
-    "half": (b"a: [1,", "not YAML"),
-    "bytes": (b"\xff\xfe\x00", "not UTF-8 text"),
+    "absent": (None, ["unreadable.yaml"]),
+    "half": (b"a: [1,", ["not YAML"]),
+    "bytes": (b"\xff\xfe\x00", ["not UTF-8 text"]),
     "twice": (
         b"a: &base {seed: 1}\nb:\n  <<: *base\n  seed: 2\nc:\n  seed: 1\n  seed: 2\n",
-        r"the key 'seed' appears twice.*line 7|line 7.*the key 'seed' appears twice",
+        ["the key 'seed' appears twice", "line 7"],
     ),
 }
 
@@ -75,9 +75,7 @@ def test_a_config_that_cannot_be_read(tmp_path: Path, name: str, kind: Any) -> N
     path, (content, message) = tmp_path / "unreadable.yaml", UNREADABLE[name]
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(ConfigurationError, match=message) as caught:
-        load_checked(kind, path)
-    assert "\n" not in str(caught.value)
+    refused(lambda: load_checked(kind, path), *message)
 
 
 def test_numbers_with_an_exponent_are_numbers(tmp_path: Path) -> None:
@@ -167,9 +165,8 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
     save = figures.save_figure
     monkeypatch.setattr(figures, "save_figure", lambda f, *to: (drawn.append(f), save(f, *to)))
     printed = succeed("demo", words).out
-    assert [sum(len(axes.containers) for axes in figure.axes) <= 6 for figure in drawn] == [
-        True
-    ] * 2
+    assert len(drawn) == 2
+    assert all(sum(len(axes.containers) for axes in figure.axes) <= 6 for figure in drawn)
     titles = [figure.get_suptitle().partition(" against ")[0] for figure in drawn]
     labels = ("Linear fusion, 2 sensors", "Tobit oscillator, 3 sensors")
     assert titles == [f"{label}: the calibrated agent" for label in labels]

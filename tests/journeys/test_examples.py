@@ -52,9 +52,8 @@ def test_it_runs_and_keeps_its_budget(name: str, tmp_path: Path) -> None:
     assert [row[: len(label)] for row, label in zip(rows, rules, strict=True)] == list(rules)
     most = content["token_rate"] + content["initial_tokens"] / 12
     for row, label in zip(rows, rules, strict=True):
-        tokens, mean, low, high, nees = (
-            float(word.strip("[,]")) for word in row[len(label) :].split()
-        )
+        words = row[len(label) :].split()
+        tokens, mean, low, high, nees = (float(word.strip("[,]")) for word in words)
         assert 0.0 < tokens <= most
         assert 0.0 < low <= mean <= high
         assert 0.2 < nees < 2.0
@@ -95,17 +94,9 @@ def test_the_tanks_are_johanssons() -> None:
         np.testing.assert_allclose(content[name], value, atol=1e-6, err_msg=name)
     # The steady state of the pumps at 3.15 V is the operating point: inflow is outflow.
     flow = tanks.OUTLET * np.sqrt(2.0 * tanks.GRAVITY * tanks.LEVEL)
-    pumped, valve = 3.15 * tanks.PUMP, tanks.VALVE
-    np.testing.assert_allclose(
-        flow,
-        [
-            valve[0] * pumped[0] + flow[2],
-            valve[1] * pumped[1] + flow[3],
-            (1 - valve[1]) * pumped[1],
-            (1 - valve[0]) * pumped[0],
-        ],
-        rtol=0.03,  # the paper prints two or three digits
-    )
+    pumped, valve = 3.15 * np.array(tanks.PUMP), np.array(tanks.VALVE)
+    inflow = np.concatenate([valve * pumped + flow[2:], ((1 - valve) * pumped)[::-1]])
+    np.testing.assert_allclose(flow, inflow, rtol=0.03)  # the paper prints two or three digits
     assert len(content["measurement_matrices"]) == 20
     levels = np.diff(np.reshape(content["censoring_threshold"], (4, 5)))
     np.testing.assert_allclose(levels, 4.0)
@@ -117,8 +108,7 @@ def test_the_page_has_what_the_script_prints(name: str) -> None:
     page = (EXAMPLES.parent / "docs" / "linear_fusion.md").read_text()
     script = str(EXAMPLES / f"{name}.py")
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
-    for row, (label, rule) in zip(
-        done.stdout.splitlines()[2:], module(name).RULES.items(), strict=True
-    ):
+    rows = done.stdout.splitlines()[2:]
+    for row, (label, rule) in zip(rows, module(name).RULES.items(), strict=True):
         tokens, error, nees = re.split(r"\s{2,}", row[len(label) :].strip())
         assert f"| `{rule}` | {tokens} | {error} | {nees} |" in page, row

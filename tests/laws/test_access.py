@@ -4,12 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import IDS, each_id, requests, short
+from cases import IDS, QUALITY, each_id, requests, short
+from refusals import refused
 
 import fusion_gym
 from fusion_gym.core.access import collisions, first_requests, place_of
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rollout import Imagination
 from fusion_gym.validation import ConfigurationError
@@ -99,13 +100,8 @@ def test_try_once_discard_grants_the_largest_discrepancies(
     kind: str, slots: int, weights: Any
 ) -> None:
     """Of those that request, by the sensors' own signals."""
-    task = task_of(
-        "CorrelatedTracking",
-        access="try_once_discard",
-        discrepancy=kind,
-        slots=slots,
-        discrepancy_weights=weights,
-    )
+    options = {"discrepancy": kind, "slots": slots, "discrepancy_weights": weights}
+    task = task_of("CorrelatedTracking", access="try_once_discard", **options)
     batch, runs = EpisodeBatch.seeded(task, 6, 0), range(6)
     for request in requests(task, 6, 10, rate=0.8):
         signals = batch.signals()
@@ -131,9 +127,7 @@ def test_equal_discrepancies_follow_the_queue() -> None:
 def test_a_sensor_that_does_not_learn_of_losses_competes_by_what_it_sent() -> None:
     """Its discrepancy is that of its own last packet, lost or not."""
     lossy = {"channel": "independent", "drop_probability": 0.5, "acknowledgements": "none"}
-    task = task_of(
-        "RemoteEstimation", sensors=3, access="try_once_discard", discrepancy="held", **lossy
-    )
+    task = task_of("RemoteEstimation", sensors=3, **lossy | HELD)
     batch, sent, apart = EpisodeBatch.seeded(task, 40, 0), np.zeros((3, 40)), 0
     everyone = np.ones((3, 40), dtype=np.bool_)
     for _ in range(30):
@@ -146,6 +140,8 @@ def test_a_sensor_that_does_not_learn_of_losses_competes_by_what_it_sent() -> No
     assert apart
 
 
+TURNS, INNOVATION = {"access": "round_robin"}, {"access": "try_once_discard"}
+HELD = INNOVATION | {"discrepancy": "held"}
 # Mean squared errors of round robin and of both discrepancies at one packet a step.
 ROWS = {
     "BiasedTracking": (1.591, 1.668, 1.368),
@@ -155,24 +151,12 @@ ROWS = {
 }
 
 
-def access_row(name: str, episodes: int) -> list[EpisodeResults]:
-    """The results of round robin and of both discrepancies on the same noise."""
-    results = []
-    for options in (
-        {"access": "round_robin"},
-        {"access": "try_once_discard", "discrepancy": "held"},
-        {"access": "try_once_discard"},
-    ):
-        more = {"filter": "adf"} if name == "BiasedOscillator" else {}
-        task = task_of(name, **options | more)
-        results.append(run_episodes(task, make_policy("always", task), episodes))
-    return results
-
-
 @pytest.mark.parametrize("name", ROWS)
 def test_try_once_discard_has_its_errors_at_equal_rate(name: str) -> None:
     """And an innovation says more than a difference from the held value."""
-    results = access_row(name, 300)
+    more = {"filter": "adf"} if name == "BiasedOscillator" else {}
+    tasks = [task_of(name, **options | more) for options in (TURNS, HELD, INNOVATION)]
+    results = [run_episodes(task, make_policy("always", task), 300) for task in tasks]
     means = [item.mse.mean() for item in results]
     errors = [item.mse.std() / 300**0.5 for item in results]
     rates = [item.rate.mean() for item in results]
@@ -186,56 +170,38 @@ def test_try_once_discard_has_its_errors_at_equal_rate(name: str) -> None:
 
 # --- interfaces -----------------------------------------------------------------------------------
 
-ACCESS_OPTIONS: list[dict[str, Any]] = [
-    {"access": "slots", "slots": 2},
-    {"access": "try_once_discard"},
-    {"access": "collision", "channels": 2, "channel": "independent"},
+NAMES = ("LinearFusion", "CorrelatedTracking", "RemoteEstimation")
+PAIRS: dict[str, Any] = {"access": "assignment", "channels": 2}
+LOSSY = PAIRS | {"channel": "independent", "drop_probability": QUALITY}
+FADING = PAIRS | {"channel": "gilbert_elliott"}
+COLLISION = {"access": "collision", "channels": 2, "channel": "independent"}
+CHANNELS = np.array([[2], [1], [2]])  # asked for by number, or left to the network
+BACKEND_CASES: list[tuple[str, dict[str, Any], Any]] = [
+    *((name, {"access": "slots", "slots": 2}, None) for name in NAMES),
+    *((name, INNOVATION, None) for name in NAMES),
+    *((name, COLLISION, None) for name in NAMES),
+    *((NAMES[1], options, asked) for options in (LOSSY, FADING) for asked in (None, CHANNELS)),
 ]
 
 
-@pytest.mark.parametrize("options", ACCESS_OPTIONS, ids=lambda options: options["access"])
-@pytest.mark.parametrize("name", ["LinearFusion", "CorrelatedTracking", "RemoteEstimation"])
+@pytest.mark.parametrize("case", BACKEND_CASES, ids=str)
 @pytest.mark.parametrize("backend", ["jax", "compiled"])
 def test_access_of_a_backend_is_that_of_numpy(
-    backend: str, name: str, options: dict[str, Any]
+    backend: str, case: tuple[str, dict[str, Any], Any]
 ) -> None:
     pytest.importorskip("jax")
+    name, options, asked = case
     more: dict[str, Any] = {"sensors": 3} if name == "RemoteEstimation" else {}
     tasks = [task_of(name, backend=kind, **options | more) for kind in ("numpy", backend)]
     batches = [EpisodeBatch.seeded(task, 4, 3) for task in tasks]
     for request in requests(tasks[0], 4, 8, rate=0.8):
-        outcomes = [batch.step(request) for batch in batches]
-        for part in ("granted", "arrived"):
+        outcomes = [batch.step(request if asked is None else request * asked) for batch in batches]
+        for part in ("requested", "granted", "arrived"):
             np.testing.assert_array_equal(*(getattr(outcome, part) for outcome in outcomes))
         np.testing.assert_allclose(*(outcome.error for outcome in outcomes), atol=1e-12)
         np.testing.assert_allclose(*(batch.observe() for batch in batches), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"access": "slot"}, r"access = 'slot' .*did you mean 'slots'"),
-        ({"slots": 2}, r"slots = 2 .* access='any'"),
-        ({"access": "single", "slots": 2}, r"slots = 2 .* access='single'"),
-        ({"access": "collision", "slots": 2}, r"slots = 2 .* access='collision'"),
-        ({"access": "slots", "slots": 4}, r"slots = 4 .* <= 3"),
-        ({"access": "slots", "slots": 0}, r"slots = 0 .* >= 1"),
-        ({"channels": 2}, r"channels = 2 .* access='any'"),
-        ({"access": "collision", "channels": 1.5}, r"channels = 1.5 .* whole number"),
-        ({"discrepancy": "held"}, r"discrepancy = 'held' .* access='any'"),
-        ({"access": "try_once_discard", "discrepancy": "age"}, r"discrepancy = 'age'"),
-        ({"access": "try_once_discard", "discrepancy_weights": (1, 0, 1)}, "discrepancy_weights"),
-        ({"discrepancy_weights": (1, 2, 1)}, r"discrepancy_weights .* access='any'"),
-        (
-            {"access": "collision", "filter": "truncated", "trigger": "send_on_delta"}
-            | {"trigger_threshold": 1.0},
-            "access = 'collision' .* no silence",
-        ),
-    ],
-)
-def test_options_without_a_use_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        task_of("RemoteEstimation", sensors=3, **options)
+    if options["access"] == "assignment":
+        refused(lambda: batches[1].step(np.full((3, 4), 3)), "channels from 1 to 2")
 
 
 def test_simulations_compare_discrepancies_from_their_first_step() -> None:

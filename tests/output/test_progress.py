@@ -6,6 +6,7 @@ import json
 import shlex
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,20 +25,15 @@ EVALUATE = [
 LONG = [name for name in EVERY if issubclass(load(name), Long)]
 
 
-class Clock:
-    """Seconds that pass when they are told to."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 1000.0
-        monkeypatch.setattr(progress.time, "monotonic", lambda: self.now)
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    return Clock(monkeypatch)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Seconds that pass when they are told to."""
+    clock = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock.now)
+    return clock
 
 
-def test_what_remains_is_reported_by_the_mean_speed_and_counts_down(clock: Clock) -> None:
+def test_what_remains_is_reported_by_the_mean_speed_and_counts_down(clock: Any) -> None:
     def left() -> str:
         return bar.line().rpartition(", ")[2]
 
@@ -60,7 +56,7 @@ def test_what_remains_is_reported_by_the_mean_speed_and_counts_down(clock: Clock
 
 
 def test_where_nobody_watches_a_line_is_printed_now_and_then(
-    clock: Clock, capsys: pytest.CaptureFixture[str]
+    clock: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     received = []
     with progress_bar(10_000, "evaluating") as bar:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import fusion_gym
 from fusion_gym.core.knowledge import Signals
@@ -19,10 +20,12 @@ from fusion_gym.policies.registry import (
 )
 from fusion_gym.validation import ConfigurationError
 
+ENV = "fusion_gym/TobitOscillator-v1"
+
 
 @pytest.fixture(scope="module")
 def task() -> Task:
-    return fusion_gym.make_task("fusion_gym/TobitOscillator-v1", filter="tobit", random_start=True)
+    return fusion_gym.make_task(ENV, filter="tobit", random_start=True)
 
 
 class Steady(Rule):
@@ -58,17 +61,12 @@ def test_a_policy_of_ones_own_is_in_every_list(task: Task) -> None:
     assert policy.threshold == 0.2
     results = fusion_gym.evaluation.run_episodes(task, policy, 4, 0)
     assert 0.0 < results.requests.mean() < 1.0
-    for text, message in (
-        ("mien", r"unknown policy 'mien': did you mean 'mine'\? .*maximum_age, mine, model"),
-        ("mine:treshold=1", r"unknown parameter of policy 'mine' 'treshold': .* 'threshold'"),
-    ):
-        with pytest.raises(ConfigurationError, match=message):
-            make_policy(text, task)
-    centre = fusion_gym.make_task(
-        "fusion_gym/TobitOscillator-v1", filter="tobit", information="centre"
-    )
-    with pytest.raises(ConfigurationError, match="policy 'mine': signal 'measurement'"):
-        make_policy("mine", centre)
+    names = "maximum_age, mine, model"
+    refused(lambda: make_policy("mien", task), "policy 'mien': did you mean 'mine'?", names)
+    unknown = "unknown parameter of policy 'mine' 'treshold': "
+    refused(lambda: make_policy("mine:treshold=1", task), unknown, "'threshold'")
+    centre = fusion_gym.make_task(ENV, filter="tobit", information="centre")
+    refused(lambda: make_policy("mine", centre), "policy 'mine': signal 'measurement'")
 
 
 @pytest.mark.usefixtures("own_table")
@@ -83,20 +81,17 @@ def test_a_maker_is_given_the_task_and_says_what_is_missing(task: Task) -> None:
     assert "gains" in policy_names("reference")
     policy: Any = make_policy("gains:gain=2", task)
     assert policy.number == 2
-    with pytest.raises(ConfigurationError, match="policy 'gains' needs a parameter 'gain'"):
-        make_policy("gains", task)
+    refused(lambda: make_policy("gains", task), "policy 'gains' needs a parameter 'gain'")
     register_policy("shapeless", lambda: Steady("clock"))
     register_policy("undeclared", lambda: Steady(None))
-    with pytest.raises(ConfigurationError, match=r"knowledge = None: it must be .* 'clock'"):
-        make_policy("undeclared", task)
+    refused(lambda: make_policy("undeclared", task), "knowledge = None: it must be ", "'clock'")
 
     class Flat(Mine):
         def __call__(self, signals: Signals) -> Any:
             return signals["measurement"][:, 0, 0] > 0.0
 
     register_policy("flat", Flat)
-    with pytest.raises(ConfigurationError, match=r"an array of bool \(3,\): .* \(3, 1\)"):
-        make_policy("flat", task)
+    refused(lambda: make_policy("flat", task), "an array of bool (3,): ", "(3, 1)")
 
 
 @pytest.mark.parametrize("value", ["high", float("nan"), {}, (1.0, float("inf")), -1.0])

@@ -1,5 +1,6 @@
 """RecordedFusion: episodes are windows of a log."""
 
+import functools
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,16 +11,16 @@ import numpy as np
 import pandas as pd
 import pytest
 from parts import Parts
+from refusals import refused
 
 import fusion_gym
 from fusion_gym import Reception
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
-from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
-from fusion_gym.recordings import Recording, fit
+from fusion_gym.recordings import FittedPlant, Recording, fit
 from fusion_gym.recordings.fitting import deviations
-from fusion_gym.systems.tobit.recorded import ResampledNoise, WindowNoise
+from fusion_gym.systems.tobit.recorded import ResampledNoise
 from fusion_gym.validation import ConfigurationError
 
 ENV = "fusion_gym/RecordedFusion-v1"
@@ -40,29 +41,36 @@ def write(folder: Path, change: Callable[[np.ndarray], Any] = lambda path: None)
     return str(folder / "log.csv")
 
 
-def make(log: str, **options: Any) -> Task:
-    plant = fit(Recording.read(log).select(), exact=True, order=1).options
-    free = {"tokens": "unlimited", "horizon": HORIZON} | plant | options
-    return fusion_gym.make_task(ENV, log=log, **free)
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return write(tmp_path_factory.mktemp("recorded"))
+
+
+@functools.cache
+def plant_of(log: str) -> FittedPlant:
+    return fit(Recording.read(log).select(), exact=True, order=1)
+
+
+def make(log: str, plant_log: str | None = None, **options: Any) -> Any:
+    """The task of a log, with the plant that was fitted to it or to another one."""
+    free = {"tokens": "unlimited", "horizon": HORIZON} | plant_of(plant_log or log).options
+    return fusion_gym.make_task(ENV, log=log, **free | options)
 
 
 def scatter(path: np.ndarray) -> None:
     path[np.random.default_rng(1).random(path.shape) < 0.1] = np.nan
 
 
-def rows_of(task: Task, runs: int) -> list[slice]:
-    assert isinstance(task.noise, WindowNoise)
+def rows_of(task: Any, runs: int) -> list[slice]:
     first = [ROWS // 2 + int(task.noise.first[run % task.noise.count]) for run in range(runs)]
     return [slice(row + 1, row + HORIZON + 1) for row in first]
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_the_truth_is_the_recording(order: int, tmp_path: Path) -> None:
+def test_the_truth_is_the_recording(order: int, log: str) -> None:
     """Also with the singular process noise of two lags."""
-    log = write(tmp_path)
-    recording = Recording.read(log).select()
-    values, rows = deviations(recording, 0.5)
-    plant = fit(recording, exact=True, order=1)
+    values, rows = deviations(Recording.read(log).select(), 0.5)
+    plant = plant_of(log)
     options: dict[str, Any] = {}
     if order == 2:
         transition, process = np.eye(4, k=-2), np.zeros((4, 4))
@@ -81,13 +89,11 @@ def test_the_truth_is_the_recording(order: int, tmp_path: Path) -> None:
         batch.step(np.zeros((2, 20), dtype=np.bool_))
 
 
-def test_held_readings_are_those_of_the_log(tmp_path: Path) -> None:
+def test_held_readings_are_those_of_the_log(log: str) -> None:
     """Report on change with hold: an independent loop over the readings, cycle included."""
-    log = write(tmp_path)
     task = make(log, filter="hold")
-    results = run_episodes(
-        task, fusion_gym.make_policy("report_on_change:reportable_change=3", task), 20, 0
-    )
+    policy = fusion_gym.make_policy("report_on_change:reportable_change=3", task)
+    results = run_episodes(task, policy, 20, 0)
     readings = Recording.read(log).values.to_numpy()
     for run, row in enumerate(rows_of(task, 20)):
         held, error, sent = readings[row.start - 1].copy(), 0.0, 0
@@ -99,8 +105,7 @@ def test_held_readings_are_those_of_the_log(tmp_path: Path) -> None:
         assert results.mse[run] * HORIZON == pytest.approx(error, rel=1e-3, abs=1e-3)
 
 
-def test_signals_are_readings(tmp_path: Path) -> None:
-    log = write(tmp_path)
+def test_signals_are_readings(log: str) -> None:
     task, readings = make(log), Recording.read(log).values.to_numpy()
     batch = EpisodeBatch.seeded(task, 5, 0)
     for step in range(10):
@@ -112,14 +117,11 @@ def test_signals_are_readings(tmp_path: Path) -> None:
         batch.step(np.zeros((2, 5), dtype=np.bool_))
 
 
-def test_a_percentage_is_of_the_reading(tmp_path: Path) -> None:
-    task = make(write(tmp_path), filter="hold")
+def test_a_percentage_is_of_the_reading(log: str) -> None:
+    task, rule = make(log, filter="hold"), "report_on_change:reportable_change"
     few, many = (
-        run_episodes(task, fusion_gym.make_policy(rule, task), 20, 0).rate.mean()
-        for rule in (
-            "report_on_change:reportable_change=6,percent=true",
-            "report_on_change:reportable_change=3",
-        )
+        run_episodes(task, fusion_gym.make_policy(f"{rule}={change}", task), 20, 0).rate.mean()
+        for change in ("6,percent=true", "3")
     )
     assert few == pytest.approx(many, rel=0.15)  # 6 % of 50
 
@@ -127,7 +129,7 @@ def test_a_percentage_is_of_the_reading(tmp_path: Path) -> None:
 def test_a_sensor_without_a_reading_does_nothing(tmp_path: Path) -> None:
     log = write(tmp_path, scatter)
     task, readings = make(log, memory=True), Recording.read(log).values.to_numpy()
-    batch, before, seen = EpisodeBatch.seeded(task, 30, 0), None, 0
+    batch, seen = EpisodeBatch.seeded(task, 30, 0), 0
     for step in range(HORIZON):
         present = np.isfinite([readings[row.start + step] for row in rows_of(task, 30)]).T
         assert (batch.signals()["sampled"] == present).all()
@@ -145,9 +147,7 @@ def test_a_sensor_without_a_reading_does_nothing(tmp_path: Path) -> None:
         assert not outcome.error[~present].any()
         assert np.isfinite(batch.observe()).all()
         seen += int((~present).sum())
-        before = outcome
     assert seen > 100
-    assert before is not None
 
 
 @pytest.mark.parametrize("options", [{}, {"memory": True}, {"filter": "hold"}])
@@ -166,10 +166,7 @@ def test_nothing_shows_the_future(options: dict[str, Any], tmp_path: Path) -> No
         gap(path)
         path[change:] = np.roll(path[change:], 7, axis=0) + 1.0
 
-    plant = fit(Recording.read(log).select(), exact=True, order=1).options
-    free = {"tokens": "unlimited", "horizon": HORIZON}
-    changed = fusion_gym.make_task(ENV, log=write(tmp_path, other), **free | plant | options)
-    assert isinstance(task.noise, WindowNoise)
+    changed = make(write(tmp_path / "changed", other), log, **options)
     assert task.noise.first[0] == 0
     batches = [EpisodeBatch.seeded(item, 1, 0) for item in (task, changed)]
     requests = np.random.default_rng(0).random((HORIZON, 2, 1)) < 0.3
@@ -184,10 +181,9 @@ def test_nothing_shows_the_future(options: dict[str, Any], tmp_path: Path) -> No
     assert not np.allclose(batches[0].observe(), batches[1].observe(), atol=1e-3)
 
 
-def test_seed_and_episode_determine_the_window(tmp_path: Path) -> None:
-    task = make(write(tmp_path))
+def test_seed_and_episode_determine_the_window(log: str) -> None:
+    task = make(log)
     noise = task.noise
-    assert isinstance(noise, WindowNoise)
     assert len({noise.window(seed, 0) for seed in range(noise.count)}) == noise.count > 30
     assert len({noise.window(0, episode) for episode in range(noise.count)}) == noise.count
     policy = fusion_gym.make_policy("periodic:period=5", task)
@@ -198,10 +194,10 @@ def test_seed_and_episode_determine_the_window(tmp_path: Path) -> None:
         run_episodes(task, policy, 100, 7)
 
 
-def test_prices_and_other_channels_are_drawn_as_without_a_recording(tmp_path: Path) -> None:
+def test_prices_and_other_channels_are_drawn_as_without_a_recording(log: str) -> None:
     price: dict[str, Any] = {"cost_weight": "random", "price_range": (0.01, 1.0)}
     price["access"] = "random"
-    task = make(write(tmp_path), **price)
+    task = make(log, **price)
     usual = fusion_gym.make_task("fusion_gym/LinearFusion-v2", **price)
     batches = [EpisodeBatch.seeded(item, 5, 3) for item in (task, usual)]
     assert np.array_equal(*(batch.price for batch in batches))
@@ -210,15 +206,12 @@ def test_prices_and_other_channels_are_drawn_as_without_a_recording(tmp_path: Pa
     assert np.array_equal(*others)
 
 
-def test_every_interface_replays_the_window(tmp_path: Path) -> None:
-    log = write(tmp_path)
-    options = fit(Recording.read(log).select(), exact=True).options
-    whole: dict[str, Any] = {"log": log, "tokens": "unlimited", "horizon": HORIZON} | options
-    single = fusion_gym.FusionEnv(fusion_gym.make_task(ENV, **whole))
-    observation, _ = single.reset(seed=3)
-    batch = EpisodeBatch.seeded(fusion_gym.make_task(ENV, **whole), 5, 0)
-    assert np.array_equal(observation, batch.observe()[3])
-    envs = fusion_gym.make_sb3_vec_env(ENV, 5, seed=0, **whole)
+def test_every_interface_replays_the_window(log: str) -> None:
+    task = make(log)
+    observation, _ = fusion_gym.FusionEnv(task).reset(seed=3)
+    assert np.array_equal(observation, EpisodeBatch.seeded(task, 5, 0).observe()[3])
+    envs = fusion_gym.FusionSB3VecEnv(task, 5)
+    envs.seed(0)
     assert np.array_equal(envs.reset()[3], observation)
 
 
@@ -252,8 +245,6 @@ def test_windows_of_few_readings_are_left_out(tmp_path: Path) -> None:
         make(write(tmp_path / name, change)).noise
         for name, change in (("whole", lambda path: None), ("part", gap))
     )
-    assert isinstance(whole, WindowNoise)
-    assert isinstance(part, WindowNoise)
     assert part.first.tolist() == np.delete(whole.first, [3, 4]).tolist()
 
 
@@ -267,9 +258,7 @@ def test_resampled_noises_are_rows_of_residuals() -> None:
     assert np.array_equal(drawn[:, 3:], PhiloxNoise().steps(0, 0, 0, 2000, 5)[:, 3:])
 
 
-def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
-    log = write(tmp_path)
-    plant = fit(Recording.read(log).select(), exact=True).options
+def test_what_is_no_recording_of_the_plant_is_refused(log: str) -> None:
     cases: list[tuple[dict[str, Any], str]] = [
         ({"measurement_covariances": [1.0, 1.0]}, "fit with --exact if it is one"),
         ({"state_names": ["a", "z"]}, "state_names = .* channels of a, b"),
@@ -283,27 +272,15 @@ def test_what_is_no_recording_of_the_plant_is_refused(tmp_path: Path) -> None:
     ]
     for options, message in cases:
         with pytest.raises(ConfigurationError, match=message):
-            fusion_gym.make_task(ENV, **{"log": log, "tokens": "unlimited"} | plant | options)
-    with pytest.raises(
-        ConfigurationError, match=r"source = 'resampled' is not allowed: .* and 100 must"
-    ):
-        fusion_gym.make_task(ENV, source="resampled")
-    with pytest.raises(ConfigurationError, match=r"transition = .* left out without a log"):
-        fusion_gym.make_task(ENV, transition=[[0.5]])
+            make(**{"log": log, "plant_log": log} | options)
+    make_task = functools.partial(fusion_gym.make_task, ENV)
+    refused(lambda: make_task(source="resampled"), "source = 'resampled' is not", "and 100 must")
+    refused(lambda: make_task(transition=[[0.5]]), "transition = ", "left out without a log")
 
 
 def test_other_weights_of_the_made_up_log_may_be_given() -> None:
     task = fusion_gym.make_task(ENV, state_weights=[1.0, 2.0, 3.0], reward_scale=2.0)
     assert task.reward.state_weights[:, 0].tolist() == [2.0, 4.0, 6.0]
-
-
-def test_the_packaged_plant_is_fitted_to_the_packaged_log() -> None:
-    plant = fit(Recording.read("tanks").select(), exact=True)
-    task = fusion_gym.make_task(ENV)
-    # The packaged plant has the measurement noise of the log's resolution.
-    transition = np.asarray(task.plant.dynamics.transition[..., 0])
-    assert transition == pytest.approx(plant.transition, abs=1e-3)
-    assert task.noise is not None
 
 
 @pytest.mark.parametrize("source", ["recorded", "normal"])

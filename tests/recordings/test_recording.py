@@ -7,6 +7,7 @@ import os
 import tarfile
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pandas as pd
 import pytest
 from command_runs import refusal, succeed
 from log_formats import draw_log
+from refusals import refused
 
 from fusion_gym.recordings import ChannelCard, RecordedChannel, Recording, fit
 from fusion_gym.validation import ConfigurationError
@@ -69,6 +71,14 @@ def shuffled(table: pd.DataFrame) -> pd.DataFrame:
 
 
 TEXT = log().to_csv(index=False)
+HEADS = ("b [m", "b 5..1", "b [m] .5..0.5", "b [m] ...", "b 1.2.3..4", "b [m] ..high")
+TIMELESS = {
+    "no column of times": log().drop(columns="time"),
+    "times in words": log(time="yesterday"),
+    "years beyond pandas": log(time=1e25),
+    "a column that rises slowly": log(time=np.cumsum(np.random.default_rng(0).random(60)) / 10),
+    "a channel of seconds": log().drop(columns="time").rename(columns={"a [m]": "period [s]"}),
+}
 REFUSED = {
     "an empty file": ("", "it must be a CSV file"),
     "a picture": (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "it must be a CSV file"),
@@ -77,79 +87,44 @@ REFUSED = {
     "one row": (log(1), "1 of its 1 rows begin with a time, and at least 20"),
     "nineteen rows": (log(19), "19 of its 19 rows begin with a time"),
     "no channel": (log()[["time"]], "its channels are []"),
-    "no column of times": (log().drop(columns="time"), "0 of its 60 rows begin with a time"),
-    "times in words": (log(time="yesterday"), "0 of its 60 rows begin with a time"),
-    "years beyond pandas": (log(time=1e25), "0 of its 60 rows begin with a time"),
-    "half the times lost": (
-        log(time=["2026-01-01", *["?"] * 59]),
-        "1 of its 60 rows begin with a time",
-    ),
+    "half the times lost": (log(time=["2026-01-01", *["?"] * 59]), "1 of its 60 rows begin"),
     "one time for all": (log(time="2026-01-01 10:00"), "all its rows have the same time"),
     "a clock that jumps to 1970": (with_cell(0, 0, "1970-01-01 00:00:00"), "look for a wrong time"),
     "a clock that jumps to 2199": (with_cell(59, 0, "2199-01-01 00:00:00"), "look for a wrong"),
-    "two channels of one name": (
-        TEXT.replace("b [m]", "a [K]"),
-        "its channels are ['a', 'a', 'c']",
-    ),
-    "no channel of numbers": (
-        log()[["time"]].assign(a=np.nan, b="on", c=1e200),
-        "its channel 'a' has no number",
-    ),
-    "an open bracket": (TEXT.replace("b [m]", "b [m"), "the head 'b [m' must be a name"),
-    "limits in reverse": (TEXT.replace("b [m]", "b 5..1"), "a unit and rising limits"),
-    "equal limits": (TEXT.replace("b [m]", "b [m] .5..0.5"), "the head 'b [m] .5..0.5' must be"),
-    "no number in a limit": (TEXT.replace("b [m]", "b [m] ..."), "the head 'b [m] ...' must be"),
-    "a limit of two points": (TEXT.replace("b [m]", "b 1.2.3..4"), "the head 'b 1.2.3..4' must be"),
+    "two channels of one name": (TEXT.replace("b [m]", "a [K]"), "channels are ['a', 'a', 'c']"),
+    "no numbers": (log()[["time"]].assign(a=np.nan, b="on", c=1e200), "channel 'a' has no number"),
+    **{
+        f"the head {head}": (TEXT.replace("b [m]", head), f"the head {head!r} must be")
+        for head in HEADS
+    },
+    **{name: (table, "0 of its 60 rows begin with a time") for name, table in TIMELESS.items()},
     "many columns": ("t" + ",x" * 300, "(301 columns: above 100,000,000 bytes or 100 channels"),
     "decimal commas without quotes": (
         "time,a,b\n" + "".join(f"{time},1,5,2,{n}\n" for n, time in enumerate(log()["time"])),
-        "its rows have more cells than heads: quote decimal commas",
+        "more cells than heads: quote decimal commas",
     ),
     "a line without an end": ("x" * 200_000, "field larger than field limit"),
     "numbers without a unit": (log(time=np.arange(60)), "numbers a unit in the head"),
-    "a column that rises slowly": (
-        log(time=np.cumsum(np.random.default_rng(0).random(60)) / 10),
-        "0 of its 60 rows begin",
-    ),
-    "a channel of seconds": (
-        log().drop(columns="time").rename(columns={"a [m]": "period [s]"}),
-        "0 of its 60 rows begin",
-    ),
     "a long log of many channels": (
-        pd.DataFrame(
-            {"time": [*log()["time"]] * 101, "name": np.repeat(np.arange(101), 60), "value": 1.0}
-        ),
+        pd.concat([log(2)[["time"]].assign(name=name, value=1.0) for name in range(101)]),
         "has 101 channels and 0 readings at the time of another; export",
     ),
     "no heads": ("\n".join(TEXT.splitlines()[1:]), "its heads are numbers, such as"),
-    "days of two orders": (
-        log(time=clock("%d/%m/%Y %H:%M", 60, "10min", "2024-03-05")),
-        "(--date-format)",
-    ),
-    "a sign of two meanings": (
-        log()[["time"]].assign(d="1,500"),
-        "their sign is decimal or separates thousands",
-    ),
-    "decimal commas in some rows": (
-        TEXT + "2026-03-02 00:00:00,1,5,2,3\n",
-        "saw 5; quote decimal commas",
-    ),
+    "days of two orders": (log(time=clock("%d/%m/%Y %H:%M", 60, "10min", "2024-03-05")), "--date"),
+    "a sign of two meanings": (log()[["time"]].assign(d="1,500"), "decimal or separates thousands"),
+    "some decimal commas": (TEXT + "2026-03-02 00:00:00,1,5,2,3\n", "saw 5; quote decimal commas"),
     "two units in a column": (log(d=["1 V", "5 mV"] * 30), "has units ['V', 'mV']"),
     "readings of several places": (
         pd.DataFrame({"time": [*log()["time"]] * 4, "sensor": "a", "value": range(240)}),
         "180 readings at the time of another; export one place",
     ),
-    "limits in words": (TEXT.replace("b [m]", "b [m] ..high"), "the head 'b [m] ..high' must be"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_log_that_is_none_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     table, message = REFUSED[name]
-    with pytest.raises(ConfigurationError, match=r"^log = ") as error:
-        read(table, tmp_path)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
+    assert refused(lambda: read(table, tmp_path), message).startswith("log = ")
 
 
 def archive(kind: str) -> bytes:
@@ -215,52 +190,34 @@ def test_a_log_is_a_regular_file_of_limited_size(
         read(TEXT, tmp_path)
 
 
-UNFIT = {
-    "a constant": (lambda a: np.where(np.arange(600) < 599, 3.0, 4.0), "change in the fitted part"),
-    "tiny numbers": (lambda a: 1e-200 * a, "change in the fitted part"),
-    "a copy": (lambda a: log(600)["b [m]"].to_numpy(), "some that do not determine each other"),
-    "late": (lambda a: np.where(np.arange(600) < 550, np.nan, a), "readings of a in the fitted"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", UNFIT)
-def test_a_log_without_a_plant_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
-    values, message = UNFIT[name]
-    for exact in ([], ["--exact"]):
-        read(changed(values), tmp_path)
-        words = ["--share=0.9", "--output", str(tmp_path / "made.yaml"), "--channels", "a", "b"]
-        assert message in refusal("fit", [str(tmp_path / "log.csv"), *words, *exact])
-        assert not (tmp_path / "made.yaml").exists()
+def test_a_log_without_a_plant_makes_no_file(tmp_path: Path) -> None:
+    read(changed(lambda a: np.where(np.arange(600) < 599, 3.0, 4.0)), tmp_path)
+    words = ["--share=0.9", "--output", str(tmp_path / "made.yaml"), "--channels", "a", "b"]
+    assert "change in the fitted part" in refusal("fit", [str(tmp_path / "log.csv"), *words])
+    assert not (tmp_path / "made.yaml").exists()
     assert "channels = () is not allowed" in refusal("fit", ["tanks", "--channels"])
 
 
 def test_a_head_without_a_unit_has_limits(tmp_path: Path) -> None:
     recording = read(TEXT.replace("a [m]", "a b -.5..2").replace("b [m]", "b ..3"), tmp_path)
-    assert recording.channels[:2] == (
-        RecordedChannel("a b", low=-0.5, high=2.0),
-        RecordedChannel("b", high=3.0),
-    )
+    low, high = RecordedChannel("a b", low=-0.5, high=2.0), RecordedChannel("b", high=3.0)
+    assert recording.channels[:2] == (low, high)
 
 
+BACK = [*log()["time"][:30], *log()["time"][24:54]]
 REMARKED = {
     "unsorted": (shuffled(log()), "times before the row above: sorted"),
-    "a clock set back": (
-        log(time=pd.concat([log()["time"][:30], log()["time"][24:54]]).to_list()),
-        "6 rows at the time of another",
-    ),
+    "a clock set back": (log(time=BACK), "6 rows at the time of another"),
     "times of two precisions": (with_cell(3, 0, "2026-03-01 00:31"), "1 times between"),
-    "a word for no reading": (with_cell(3, 1, "off"), "1 cells without a finite number"),
     "rows twice": (pd.concat([log(), log()]), "60 rows at the time of another"),
     "rows beside the even times": (with_cell(7, 0, "2026-03-01 01:14:00"), "1 times between"),
-    "text in a cell": (with_cell(3, 1, "ERR"), "1 cells without a finite number"),
-    "infinity in a cell": (with_cell(3, 1, "inf"), "1 cells without a finite number"),
-    "a column of words": (log(d="on"), "column 'd' has no numbers: left out"),
-    "an empty column": (log(d=np.nan), "column 'd' has no numbers: left out"),
-    "a column of huge numbers": (log(d=1e200), "column 'd' has no numbers: left out"),
-    "a column of infinities": (log(d=np.inf), "column 'd' has no numbers: left out"),
+    **{f"{text} in a cell": (with_cell(3, 1, text), "1 cells without a finite number")
+       for text in ("off", "ERR", "inf")},
+    **{f"a column of {d}": (log(d=d), "column 'd' has no numbers: left out")
+       for d in ("on", np.nan, 1e200, np.inf)},
     "a row without a time": (with_cell(3, 0, ""), "1 rows without a time: left out"),
     "a row with a broken time": (with_cell(3, 0, "2026-13-45"), "1 rows without a time"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", REMARKED)
@@ -356,31 +313,12 @@ def test_a_channel_that_disagrees_with_agreeing_peers_is_faulty(
     assert not any(faults.values())
 
 
-FORMATS: dict[str, Callable[[str], str | bytes]] = {
-    "semicolons and decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
-    "tabs": lambda text: text.replace(",", "\t"),
-    "a byte order mark": lambda text: b"\xef\xbb\xbf" + text.encode(),
-    "lines of Windows": lambda text: text.replace("\n", "\r\n"),
-    "time zones": lambda text: text.replace(":00,", ":00+02:00,"),
-}
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_formats_of_the_same_log_have_the_same_values(name: str, tmp_path: Path) -> None:
-    expected = read(TEXT, tmp_path)
-    recording = read(FORMATS[name](TEXT), tmp_path)
-    assert np.array_equal(recording.values, expected.values)
-    assert recording.channels == expected.channels
-
-
-LOGGERS: dict[str, str] = {
-    "quotes": log().to_csv(index=False, quoting=1),
+LOGGERS: dict[str, str | bytes] = {
+    "a byte order mark": b"\xef\xbb\xbf" + TEXT.encode(),
+    "lines of Windows": TEXT.replace("\n", "\r\n"),
+    "time zones": TEXT.replace(":00,", ":00+00:00,"),
     "row numbers": log().to_csv(quoting=2),
     "lines above": "Station: x\nSerial: 7\n" + TEXT,
-    "TOA5": '"TOA5","x","CR1000"\n"TIMESTAMP","a","b","c"\n"TS","m","m","m"\n"","Smp","Smp","Smp"\n'
-    + TEXT.partition("\n")[2],
-    "date and clock": TEXT.replace("time,", "day,clock,").replace("2026-03-01 ", "2026-03-01,"),
-    "long": log().melt("time", var_name="sensor").to_csv(index=False),
     "Home Assistant": log().melt("time", var_name="entity_id", value_name="state")[
         ["entity_id", "state", "time"]].rename(
             columns={"time": "last_changed"}).to_csv(index=False),
@@ -405,7 +343,7 @@ def test_a_drawn_format_is_read_right_or_refused(tmp_path: Path) -> None:
     for seed in range(100):
         drawn = draw_log(seed)
         try:
-            assert drawn.verdict(read(drawn.text, tmp_path)) == "", (seed, drawn.features)
+            assert drawn.verdict(read(drawn.text, tmp_path)) == "", seed
             right += 1
         except ConfigurationError:
             assert len(drawn.truth.index.normalize().unique()) == 1
@@ -425,9 +363,8 @@ DATES = {
 @pytest.mark.parametrize("name", DATES)
 def test_all_rows_decide_the_order_of_a_date(name: str, tmp_path: Path) -> None:
     form, rows, every, start, remark = DATES[name]
-    recording = read(
-        pd.DataFrame({"time": clock(form, rows, every, start), "a": walk(rows)}), tmp_path
-    )
+    table = pd.DataFrame({"time": clock(form, rows, every, start), "a": walk(rows)})
+    recording = read(table, tmp_path)
     expected = pd.date_range(start, periods=rows, freq=every)
     assert (recording.values.index == expected).all()
     assert np.array_equal(recording.values["a"], walk(rows))
@@ -439,19 +376,20 @@ def test_all_rows_decide_the_order_of_a_date(name: str, tmp_path: Path) -> None:
     ("head", "factor", "unit", "seconds"),
     [("elapsed [min]", 5.0, None, 300), ("time (h)", 0.5, None, 1800),
      ("time_ms", 40.0, None, 0.04),
-     ("t", 5.0, "s", 5), ("days", 1 / 24, "excel", 3600), ("Unix time", 10.0, None, 10)],
+     ("t", 5.0, "s", 5), ("days", 1 / 24, "excel", 3600), ("Unix time", 10.0, None, 10),
+     ("time", 30.0, None, 30)],
 )  # fmt: skip
 def test_numeric_times_have_a_unit(
     head: str, factor: float, unit: str | None, seconds: float, tmp_path: Path
 ) -> None:
-    zero = 1.7e9 if "Unix" in head else 45352.0 if unit == "excel" else 0.0
-    pd.DataFrame({head: zero + factor * np.arange(100), "a": walk(100)}).to_csv(
-        tmp_path / "log.csv", index=False
-    )
-    recording = Recording.read(tmp_path / "log.csv", time_unit=unit)
+    zero = 1.7e9 if head in ("Unix time", "time") else 45352.0 if unit == "excel" else 0.0
+    path, table = tmp_path / "log.csv", {head: zero + factor * np.arange(100), "a": walk(100)}
+    pd.DataFrame(table).to_csv(path, index=False)
+    recording = Recording.read(path, time_unit=unit)
     assert recording.interval == pd.Timedelta(seconds, "s")
     assert len(recording.values) == 100
-    assert unit != "excel" or str(recording.values.index[0]) == "2024-03-01 00:00:00"
+    first = {"excel": "2024-03-01 00:00:00", None: "2023-11-14 22:13:20"}.get(unit if zero else "")
+    assert first is None or str(recording.values.index[0]) == first
 
 
 @pytest.mark.parametrize("late", [0.0, 0.04, 2.0, 5.0])
@@ -514,10 +452,8 @@ def test_a_limit_is_no_error_code_and_a_given_code_is(tmp_path: Path) -> None:
     values[7] = -1.25
     read(pd.DataFrame({"time": clock("%Y-%m-%d %H:%M", 4000), "a": values}), tmp_path)
     recording = Recording.read(tmp_path / "log.csv", error_codes=[-1.25, 77.0])
-    assert recording.remarks == (
-        "a: 1 readings of -1.25 are an error code: no reading",
-        "no reading is the error code 77",
-    )
+    hit = "a: 1 readings of -1.25 are an error code: no reading"
+    assert recording.remarks == (hit, "no reading is the error code 77")
     assert (recording.values["a"] == 35.0).sum() > 100
 
 
@@ -572,29 +508,24 @@ def test_silence_of_a_log_on_change_is_no_missing_reading(size: float, tmp_path:
     recording = Recording.read(tmp_path / "log.csv")
     assert recording.interval == pd.Timedelta("1min")
     assert recording.card[0].change == pytest.approx(size, rel=0.1)
-    with pytest.raises(ConfigurationError, match=r"recorded on change.*--on-change"):
-        fit(recording.select())
+    refused(lambda: fit(recording.select()), "recorded on change", "--on-change")
     held = recording.select().hold()
     assert fit(held, order=1).transition.item() == pytest.approx(0.63, abs=0.05)
     assert "the last reading" in held.remarks[-1]
-    assert (
-        f"a: recorded on change by {recording.card[0].change:g}"
-        in succeed("info", [str(tmp_path / "log.csv")]).out
-    )
+    printed = succeed("info", [str(tmp_path / "log.csv")]).out
+    assert f"a: recorded on change by {recording.card[0].change:g}" in printed
 
 
 @pytest.mark.parametrize("digits", [1, 8])
 def test_a_log_with_random_gaps_is_not_on_change(digits: int) -> None:
     path = np.where(np.random.default_rng(0).random(2000) < 0.3, np.nan, walk(2000).round(digits))
     index = pd.date_range("2026-01-01", periods=2000, freq="1min")
-    assert (
-        Recording(pd.DataFrame({"a": path}, index), (RecordedChannel("a"),)).card[0].change == 0.0
-    )
+    recording = Recording(pd.DataFrame({"a": path}, index), (RecordedChannel("a"),))
+    assert recording.card[0].change == 0.0
 
 
-def test_a_written_log_is_read_without_options(tmp_path: Path) -> None:
-    for name in ("tanks", "mast"):
-        recording = Recording.read(name)
+def test_a_written_log_is_read_without_options(mast: Recording, tmp_path: Path) -> None:
+    for recording in (Recording.read("tanks"), replace(mast, values=mast.values[:2000])):
         recording.write(tmp_path / "log.csv")
         again = Recording.read(tmp_path / "log.csv")
         assert again.values.equals(recording.values)
@@ -614,16 +545,8 @@ def test_times_of_two_zones_are_one_clock(tmp_path: Path) -> None:
 
 def test_a_wrong_time_is_named(tmp_path: Path) -> None:
     times = log()["time"].where(np.arange(60) < 59, "2926-01-01 00:00:00")
-    with pytest.raises(ConfigurationError, match=r"2926-01-01 00:00:00.* too many for its 60 rows"):
-        read(log(time=times), tmp_path)
-    with pytest.raises(ConfigurationError, match="it must be the path of a CSV file"):
-        Recording.read(3)  # type: ignore[arg-type]
-
-
-def test_seconds_are_times(tmp_path: Path) -> None:
-    recording = read(log(time=np.arange(60) * 30 + 1.7e9), tmp_path)
-    assert recording.interval == pd.Timedelta("30s")
-    assert str(recording.values.index[0]) == "2023-11-14 22:13:20"
+    refused(lambda: read(log(time=times), tmp_path), "2926-01-01 00:00:00", "for its 60 rows")
+    refused(lambda: Recording.read(3), "it must be the path of a CSV file")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("beside", [False, True])
@@ -641,14 +564,13 @@ def test_a_gap_leaves_steps_without_readings(tmp_path: Path) -> None:
     assert recording.gaps == (1, pd.Timedelta("100min"))
 
 
-def test_the_mast_has_one_faulty_anemometer() -> None:
+def test_the_mast_has_one_faulty_anemometer(mast: Recording) -> None:
     """As other measures have it: correlation .76 with the median of its peers."""
-    recording = Recording.read("mast")
-    faults = {row.channel.name: row.fault for row in recording.card if row.fault}
+    faults = {row.channel.name: row.fault for row in mast.card if row.fault}
     assert faults == {"Spd80mS": "disagrees with its peers"}
-    assert card(recording, "Spd80mS").agreement == pytest.approx(0.76, abs=0.005)
-    assert recording.gaps[1] == pytest.approx(pd.Timedelta("19.68 days"), abs=pd.Timedelta("15min"))
-    names = [channel.name for channel in recording.select().channels]
+    assert card(mast, "Spd80mS").agreement == pytest.approx(0.76, abs=0.005)
+    assert mast.gaps[1] == pytest.approx(pd.Timedelta("19.68 days"), abs=pd.Timedelta("15min"))
+    names = [channel.name for channel in mast.select().channels]
     assert names == ["Spd80mN", "Spd60mN", "Spd60mS", "Spd40mN", "Spd40mS", "T2m"]
 
 
@@ -657,10 +579,7 @@ def test_selected_channels_have_no_readings_at_their_limits() -> None:
     assert (recording.values["middle"] == 54.0).any()
     chosen = recording.select(["middle"])
     assert chosen.values["middle"].max() < 54.0
-    with pytest.raises(
-        ConfigurationError, match=r"channels = .*'lake'.* it must be some of inflow"
-    ):
-        recording.select(["lake"])
+    refused(lambda: recording.select(["lake"]), "channels = ", "'lake'", "must be some of inflow")
 
 
 def test_info_prints_the_card_and_draws_it(tmp_path: Path) -> None:
