@@ -56,6 +56,7 @@ def test_every_option_of_every_command_is_tried() -> None:
     assert len(list(tries())) > 500
 
 
+@pytest.mark.slow
 def test_what_is_not_allowed_is_reported_in_one_line(here: Path) -> None:
     assert {str(item): message for item in selected() if (message := flaw(item, here))} == {}
 

@@ -76,6 +76,7 @@ def test_lists_and_flags_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (command.results, command.workers) == (None, 2)
 
 
+@pytest.mark.slow
 def test_all_commands_under_one_name() -> None:
     def run(*words: str) -> subprocess.CompletedProcess[str]:
         line = [sys.executable, "-m", "fusion_gym.commands", *words]

@@ -1,6 +1,5 @@
 """fusion-gym field: from a log to the settings of devices."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,11 +13,9 @@ from command_runs import call, refusal, succeed
 
 import fusion_gym
 from fusion_gym.commands import field
-from fusion_gym.commands.field import AGENT
 from fusion_gym.evaluation import field_study, run_episodes
 from fusion_gym.evaluation.devices import fields_of, longest_interval, step_of
 from fusion_gym.evaluation.field_study import (
-    METHODS,
     PRACTICE,
     FieldStudy,
     MethodPoint,
@@ -96,52 +93,11 @@ def test_errors_are_means_of_the_steps_with_readings() -> None:
     assert result.errors[1] == pytest.approx(3.0 * result.errors[0])
 
 
-@pytest.fixture
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small studies."""
-    few = {"_TRIALS": 2, "_EPISODES": 4, "_CLOSE": 0.3, "FACTORS": (0.5, 1.0, 2.0), "RESAMPLES": 20}
-    for name, value in few.items():
-        monkeypatch.setattr(field_study, name, value)
-
-
-def test_a_study_ends_in_the_settings_of_devices(
-    few: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(field, "_WINDOWS", 50)  # of 20 steps
-    monkeypatch.setattr(field_study, "_CLOSE", 0.5)
-    folder, tanks = tmp_path / "field", Recording.read("tanks")
-    replace(tanks, values=tanks.values[:2000]).write(tmp_path / "log.csv")
-    words = [str(tmp_path / "log.csv"), "--exact", "--output", str(folder), "--workers", "1"]
-    words += ["--timesteps", "300"]
-    printed = succeed("field", words).out
-    settings = yaml.safe_load((folder / "devices.yaml").read_text())
-    assert list(settings) == ["inflow", "middle", "outflow"]
-    assert all(row["min_interval"] == 60.0 for row in settings.values())
-    assert all(row["max_interval"] == 12_000.0 for row in settings.values())
-    assert all(0.1 < row["reportable_change"] < 30.0 for row in settings.values())
-    report = (folder / "report.md").read_text()
-    for text in (*METHODS, AGENT, "packets a day", "`devices.yaml`", "![Error over packets]"):
-        assert text in report
-    assert printed.strip() in report
-    assert "<table>" in (folder / "report.html").read_text()
-    assert {path.name for path in folder.glob("*.png")} == {"card.png", "curves.png"}
-    code = report.split("```python\n")[1].split("```")[0]
-    monkeypatch.chdir(folder)
-    exec(code, {})
-    assert "already holds a study" in refusal("field", words)
-    assert "target_rate = 0.1 differs" in refusal("field", [*words, "--target-rate=.1", "--resume"])
-    (folder / "silence_used.json").unlink()
-    before = json.loads((folder / "practice.json").read_text())
-    again = succeed("field", [*words, "--resume"]).out
-    assert again == printed
-    assert json.loads((folder / "practice.json").read_text()) == before
-
-
 ROOM = ["--exact", "--share", "0.6", "--workers", "1", "--timesteps", "10"]
 
 
 @pytest.fixture
-def room(few: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def room(small_studies: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The words of a short study of a room, whose agent is the centralised rule."""
     monkeypatch.setattr(field, "train_agent", lambda study, *_: measure(study, "centralised"))
     write_room(tmp_path / "room.csv")
@@ -157,6 +113,7 @@ def write_room(file: Path, noise: float = 0.0, rows: int = 2400) -> None:
     pd.DataFrame(path, index, ["air [°C]", "damp [%]"]).to_csv(file, float_format="%.2f")
 
 
+@pytest.mark.slow
 def test_the_least_packets_keep_the_tolerance_with_what_a_device_holds(
     room: list[str], tmp_path: Path
 ) -> None:
@@ -192,6 +149,7 @@ def test_the_least_packets_keep_the_tolerance_with_what_a_device_holds(
     assert excess[0] <= 1.0 < excess[1]
 
 
+@pytest.mark.slow
 def test_a_tolerance_that_no_setting_keeps_is_said(room: list[str]) -> None:
     """A step of 1 hPa is too large."""
     log = Path(room[0])
@@ -200,6 +158,7 @@ def test_a_tolerance_that_no_setting_keeps_is_said(room: list[str]) -> None:
     assert "**No setting keeps the tolerance**" in printed
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_continues_within_a_method(
     room: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

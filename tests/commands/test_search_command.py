@@ -84,6 +84,7 @@ def test_compare_asks_the_rule_at_every_price() -> None:
     assert "prices = 3 is not allowed: it must be left out with policy = 'always'" in message
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_ends_as_the_uninterrupted_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -75,6 +75,7 @@ def test_what_cannot_be_watched_is_refused_at_once() -> None:
     refused(lambda: watch(task, {}), "policies")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
 def test_the_command_writes_films(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -66,6 +66,7 @@ def test_silence_costs_about_one_a_step() -> None:
     assert np.mean(rewards) == pytest.approx(-1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_bound_starved_for_thousands_of_steps_does_not_overflow() -> None:
     env = gymnasium.make(ENV_ID, horizon=2500)
     env.reset(seed=0)

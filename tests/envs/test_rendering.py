@@ -83,6 +83,7 @@ def test_a_vector_environment_draws_every_run(mode: str) -> None:
     assert blind.unwrapped.call("render") == (None, None)
 
 
+@pytest.mark.slow
 def test_recorders_write_films(tmp_path: Path) -> None:
     env: Any = RecordVideo(
         gym.make(PICTURE, render_mode="rgb_array", horizon=4), str(tmp_path / "gym"),

@@ -241,6 +241,7 @@ def test_envelope_by_hand() -> None:
     refused(lambda: lower_envelope({}), "at least one")
 
 
+@pytest.mark.slow
 def test_the_zoo_the_evaluation_and_the_list_do_without_torch() -> None:
     lines = (
         "import sys, fusion_gym",

@@ -51,6 +51,7 @@ def test_no_error_at_all_can_be_compared() -> None:
     assert list(price_table([point], every).columns[6].cells) == ["–"] * 2
 
 
+@pytest.mark.slow
 def test_a_rule_is_compared_under_its_name_in_few_curves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,6 +61,7 @@ def test_costs_beside_each_other_are_those_of_episodes() -> None:
     assert len({float(single.tokens.mean()) for single in singles}) == 3
 
 
+@pytest.mark.slow
 def test_a_search_from_a_bad_start_lowers_the_cost() -> None:
     """Bounds allow too large thresholds only: the search saves a quarter on fresh episodes."""
     search = small(bounds=(0.5, 1.0), generations=16, population=8, episodes=(4, 16))
@@ -79,6 +80,7 @@ def test_a_search_from_a_bad_start_lowers_the_cost() -> None:
     assert result.relative == pytest.approx((costs[0] / costs[1]).mean() - 1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_resumed_search_is_the_uninterrupted_one() -> None:
     every = list(run_generations(small()))
     assert len(every) == 4
@@ -187,7 +189,10 @@ LOOP_TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("name", LOOP_TASKS)
+@pytest.mark.parametrize(
+    "name",
+    [*(pytest.param(n, marks=pytest.mark.slow) for n in ("tobit", "biased")), "linear", "remote"],
+)
 def test_the_loop_in_machine_code_has_the_figures_of_numpy(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -180,11 +180,15 @@ BACKEND_CASES: list[tuple[str, dict[str, Any], Any]] = [
     *((name, {"access": "slots", "slots": 2}, None) for name in NAMES),
     *((name, INNOVATION, None) for name in NAMES),
     *((name, COLLISION, None) for name in NAMES),
-    *((NAMES[1], options, asked) for options in (LOSSY, FADING) for asked in (None, CHANNELS)),
+    *((NAMES[2], options, asked) for options in (LOSSY, FADING) for asked in (None, CHANNELS)),
+]
+EACH_BACKEND = [
+    pytest.param(case, marks=pytest.mark.slow if case[0] == "CorrelatedTracking" else ())
+    for case in BACKEND_CASES
 ]
 
 
-@pytest.mark.parametrize("case", BACKEND_CASES, ids=str)
+@pytest.mark.parametrize("case", EACH_BACKEND, ids=str)
 @pytest.mark.parametrize("backend", ["jax", "compiled"])
 def test_access_of_a_backend_is_that_of_numpy(
     backend: str, case: tuple[str, dict[str, Any], Any]

@@ -211,7 +211,7 @@ def test_the_functional_environment_assigns() -> None:
     jax = pytest.importorskip("jax")
     from fusion_gym.jax import make
 
-    env, _ = make(NAME, **ASSIGNED)
+    env, _ = make("fusion_gym/RemoteEstimation-v1", sensors=3, **ASSIGNED)
     assert env.num_actions == 2
     _, state = jax.jit(env.reset)(jax.random.key(0))
     noise, step = np.zeros((env._channels, 1)), jax.jit(env.step_env)

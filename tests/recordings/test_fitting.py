@@ -53,6 +53,7 @@ def test_least_squares_finds_the_plant_within_its_intervals() -> None:
     assert np.all(np.abs(plant.process_covariance - W) < 4.0 * deviation)
 
 
+@pytest.mark.slow
 def test_likelihood_finds_the_plant_despite_gaps_and_two_rates() -> None:
     path = simulate(6000)
     path[np.random.default_rng(1).random(path.shape) < 0.1] = np.nan
@@ -220,6 +221,7 @@ def test_a_log_without_a_plant_is_refused(name: str, exact: bool) -> None:
     refused(lambda: fit(recording(path), share, exact=exact), message)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", [True, False])
 @pytest.mark.parametrize("gaps", [0.0, 0.2])
 def test_a_plant_is_the_same_in_every_unit(exact: bool, gaps: float) -> None:
@@ -240,6 +242,7 @@ def test_a_plant_is_the_same_in_every_unit(exact: bool, gaps: float) -> None:
     refused(lambda: plants[0].options, "deviation of c0 = ", ">= 1e-07")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", [True, False])
 def test_a_channel_may_be_silent_for_long(exact: bool) -> None:
     """Silent in the last 3,100 rows of the fitted part: the rows before have its coefficients."""
@@ -265,6 +268,7 @@ def test_an_alarm_that_begins_late_is_fitted() -> None:
     assert np.isfinite(fit(recording(path), exact=True).transition).all()
 
 
+@pytest.mark.slow
 def test_the_mast_has_errors_near_the_models(mast: Recording) -> None:
     own = mast.select()
     plant, (values, rows) = fit(own, exact=True), deviations(own, 0.5)
@@ -273,6 +277,7 @@ def test_the_mast_has_errors_near_the_models(mast: Recording) -> None:
     assert plant.order == 1
 
 
+@pytest.mark.slow
 def test_the_option_file_is_a_plant_of_the_environment_and_the_packaged_one(tmp_path: Path) -> None:
     output = tmp_path / "tanks.yaml"
     printed = succeed("fit", ["tanks", "--exact", "--output", str(output)])

@@ -329,6 +329,7 @@ LOGGERS: dict[str, str | bytes] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOGGERS)
 def test_loggers_write_the_same_log(name: str, tmp_path: Path) -> None:
     expected, recording = read(TEXT, tmp_path), read(LOGGERS[name], tmp_path)
@@ -337,6 +338,7 @@ def test_loggers_write_the_same_log(name: str, tmp_path: Path) -> None:
     assert recording.channels == expected.channels
 
 
+@pytest.mark.slow
 def test_a_drawn_format_is_read_right_or_refused(tmp_path: Path) -> None:
     """Dates of one day, whose order no row shows, are refused."""
     right = 0
@@ -524,6 +526,7 @@ def test_a_log_with_random_gaps_is_not_on_change(digits: int) -> None:
     assert recording.card[0].change == 0.0
 
 
+@pytest.mark.slow
 def test_a_written_log_is_read_without_options(mast: Recording, tmp_path: Path) -> None:
     for recording in (Recording.read("tanks"), replace(mast, values=mast.values[:2000])):
         recording.write(tmp_path / "log.csv")
@@ -564,6 +567,7 @@ def test_a_gap_leaves_steps_without_readings(tmp_path: Path) -> None:
     assert recording.gaps == (1, pd.Timedelta("100min"))
 
 
+@pytest.mark.slow
 def test_the_mast_has_one_faulty_anemometer(mast: Recording) -> None:
     """As other measures have it: correlation .76 with the median of its peers."""
     faults = {row.channel.name: row.fault for row in mast.card if row.fault}

@@ -154,7 +154,13 @@ def fit_once(recording: Recording, **options: Any) -> FittedPlant:
     return FITS[key]
 
 
-@pytest.mark.parametrize("name", NAMES)
+LONG = ("fusion_gym.recordings.", "fusion_gym.jax.FiveValueEnv")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n.startswith(LONG) else ()) for n in NAMES],
+)
 def test_an_example_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registration, "ENVIRONMENTS", dict(registration.ENVIRONMENTS))
     monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))

@@ -81,7 +81,7 @@ def test_a_linear_case_is_filterpys(linear: Any) -> None:
 def test_a_known_start_is_the_limit_of_uncertain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     results = []
     for start in (0.0, 1e-12):
-        monkeypatch.setitem(globals(), "START", start * np.eye(2))
+        monkeypatch.setattr("linear_case.START", start * np.eye(2))
         made = Linear()
         system = Parts(made.plant, made.estimator)
         noise = np.random.default_rng(0).standard_normal((6, 6, 3))
