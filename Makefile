@@ -4,11 +4,12 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 LOWEST := .venv-lowest
+INSTALL = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --constraint constraints.txt
 # A part of the tests that touches every dependency.
 QUICK  := tests/laws/test_interfaces.py tests/core/test_bad_input.py tests/envs/test_environment_api.py \
 	tests/evaluation/test_evaluation.py tests/policies/test_model_files.py \
 	tests/training/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
-	tests/benchmark/test_benchmark.py::test_from_prices_to_pages_and_zoo
+	tests/journeys/test_newcomer.py tests/journeys/test_field_study.py
 
 .PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers papers-check zoo newcomer pages docs integrations \
 	integrations-tianshou integrations-rejax integrations-rllib lines lint format bench clean
@@ -21,8 +22,8 @@ help:  ## list the targets
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,test]'
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile --constraint constraints.txt torch uv
+	$(INSTALL) --editable '.[agents,test]'
 	touch $@
 
 demo: $(STAMP)  ## train two agents and compare them with rules under the same budget: runs/demo/
@@ -38,7 +39,7 @@ test-all: $(STAMP)  ## all tests
 # GPU libraries.
 $(LOWEST)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv --clear $(LOWEST)
-	$(LOWEST)/bin/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt torch uv
+	$(LOWEST)/bin/python -m pip install --disable-pip-version-check --quiet --no-compile --constraint constraints.txt torch uv
 	grep '^torch==' constraints.txt > $(LOWEST)/torch.txt
 	$(LOWEST)/bin/uv pip install --quiet --system-certs --python $(LOWEST)/bin/python \
 		--resolution lowest-direct --overrides $(LOWEST)/torch.txt \
@@ -49,7 +50,7 @@ mutants: $(STAMP)  ## tests that must fail, each on a known wrong variant of the
 	$(BIN)/python tests/mutants/apply.py
 
 mutants-sample: $(STAMP)  ## the share of killed mutants in 18 modules, 300 drawn by a seed
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt mutmut
+	$(INSTALL) mutmut
 	mkdir -p runs
 	$(BIN)/python tests/mutants/sample.py --output runs/mutants.json --resume
 
@@ -134,7 +135,7 @@ format: $(STAMP)  ## let ruff mend what it can
 
 # Beside the other packages, for the tutorials train agents. Warnings end it. The outputs of the pages' Python stay in runs/docs/.
 $(VENV)/.docs: $(STAMP)
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,docs]'
+	$(INSTALL) --editable '.[agents,docs]'
 	touch $@
 
 pages: $(STAMP)  ## tables and the picture of networks in docs/, from the code

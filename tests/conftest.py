@@ -63,7 +63,7 @@ def registries() -> Iterator[None]:
 
 def aspects(item: Any) -> set[str]:
     """The values that parameters have in a test, and what a case of laws is a case of."""
-    test, values = item.originalname, item.callspec.params.values()
+    test, values = item.nodeid.partition("[")[0], item.callspec.params.values()
     result = {f"{test} {place} {value}" for place, value in enumerate(item.callspec._idlist)}
     for case in (value for value in values if hasattr(value, "aspects")):
         result = {aspect for aspect in result if str(case) not in aspect}
