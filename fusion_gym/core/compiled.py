@@ -5,14 +5,13 @@ The code is kept in ``~/.cache/fusion-gym/compiled``, so that only the first sta
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import dataclasses
 import functools
 import hashlib
 import io
-import os
 import pickle
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
+from fusion_gym.core import code_cache
 from fusion_gym.core.rows import RowStep
 from fusion_gym.core.task import Task
 from fusion_gym.errors import ConfigurationError
@@ -32,9 +32,9 @@ from fusion_gym.lowering import Buffer, LoweringError, assembly
 require("backend='compiled'", "compiled", "llvmlite")
 import llvmlite.binding as llvm  # noqa: E402
 
-_FOLDER = Path.home() / ".cache" / "fusion-gym" / "compiled"
 _PACKAGE = Path(__file__).parent.parent
 _LOADED: dict[str, tuple[Any, int]] = {}  # engines and addresses
+_LOCK = threading.RLock()  # of the threads that compile
 
 
 def make_step(task: Task, *parts: Any) -> CompiledStep | None:
@@ -156,52 +156,40 @@ def compile_function(
         return assembly(closed, sources, sinks)
 
     pointers = [ctypes.c_void_p] * (len(sources) + len(sinks))
-    return ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(_machine_code(key, source))
+    with _LOCK:
+        engine, address = _machine_code(key, source)
+    result: Any = ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(address)
+    result.engine = engine  # whose code LLVM frees with it
+    return result
 
 
-def _machine_code(task: Any, source: Callable[[], str]) -> int:
-    """Return the address of code from this process, from the cache, or compiled of its assembly.
+def _machine_code(task: Any, source: Callable[[], str]) -> tuple[Any, int]:
+    """Return engine and address of code from this process, the cache, or compiled of its assembly.
 
-    The cache has the code of an assembly, and the hash of a task's assembly.
+    The cache has the code of a task and that of an assembly, which other sources may share.
     """
     name = _fingerprint(task)
     if name in _LOADED:
-        return _LOADED[name][1]
-    stored = name and _read(name)
-    key = stored.decode() if stored else ""
-    code = key and _read(key)
+        return _LOADED[name]
+    code = name and code_cache.read(_folder(), name)
     if not code:
         text = source()
         key = hashlib.sha256(f"{_surroundings()}{text}".encode()).hexdigest()
-        code = _read(key) or _compile(text)
-        _write(key, code)
-        if name:
-            _write(name, key.encode())
-    if key not in _LOADED:
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(jit=True))
-        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-        engine.finalize_object()
-        _LOADED[key] = engine, engine.get_function_address("step")
-    _LOADED[name or key] = _LOADED[key]
-    return _LOADED[key][1]
+        code = code_cache.read(_folder(), key) or _compile(text)
+        for file in filter(None, (name, key)):
+            code_cache.write(_folder(), file, code)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(jit=True))
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    result = engine, engine.get_function_address("step")
+    if name:
+        _LOADED[name] = result
+    return result
 
 
-def _read(key: str) -> bytes | None:
-    """Return the whole content of a file, or ``None``."""
-    with contextlib.suppress(OSError):
-        content = (_FOLDER / key).read_bytes()
-        if hashlib.sha256(content[32:]).digest() == content[:32]:
-            return content[32:]
-    return None
-
-
-def _write(key: str, content: bytes) -> None:
-    """Store the content of a file, with its hash, where the folder can be written."""
-    with contextlib.suppress(OSError):
-        _FOLDER.mkdir(parents=True, exist_ok=True)
-        part = _FOLDER / f"{key}.{os.getpid()}"
-        part.write_bytes(hashlib.sha256(content).digest() + content)
-        part.replace(_FOLDER / key)
+@functools.cache
+def _folder() -> Path | None:
+    return code_cache.folder_of("compiled")
 
 
 def _compile(text: str) -> bytes:

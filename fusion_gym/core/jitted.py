@@ -9,13 +9,13 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, arrays_of, map_arrays
+from fusion_gym.core import code_cache
 from fusion_gym.core.rows import RowStep
 from fusion_gym.core.runs import Branch, Position, advance, start_of
 from fusion_gym.importing import require
@@ -27,8 +27,8 @@ from jax._src.xla_bridge import backends_are_initialized  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_cpu_enable_async_dispatch", False)  # threads cost more than a step
-if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-    folder = Path.home() / ".cache" / "fusion-gym" / "jax"
+_chosen = getattr(jax.config, "jax_compilation_cache_dir", None)
+if _chosen is None and (folder := code_cache.folder_of("jax")):
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 

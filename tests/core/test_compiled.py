@@ -2,9 +2,13 @@
 
 import ctypes
 import dataclasses
+import hashlib
+import os
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +91,19 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
     "few": (lambda a, i: a[i.astype(int)], (VALUES[1:6], [3.0, 0.0, 4.0])),
     "many": (lambda a, i: (a + 0.0)[i.astype(int)], (np.arange(20.0), [19.0, 0.0, 7.0])),
     "a table": (lambda i: jnp.asarray(np.arange(30.0) ** 2)[i.astype(int)], ([29.0, 3.0],)),
+    "outside": (
+        lambda a, i: jnp.stack(
+            [
+                jnp.asarray(a).at[i.astype(int)].get(mode=mode, fill_value=7.0)
+                for mode in ("fill", "clip")
+            ]
+        ),
+        (VALUES[1:6], [-9.0, 7.0, 4.0, 5.0, -5.0]),
+    ),
+    "signs": (
+        lambda a, b: jnp.stack((a.astype(int) < b.astype(int), a.astype(int) >= b.astype(int))),
+        ([-3.0, 2.0, -1.0], [2.0, -3.0, -1.0]),
+    ),
     "rows": (lambda a, i: a.reshape(4, 3)[i.astype(int), 1:], (np.arange(12.0), [3.0, 1.0])),
     "pairs": (
         lambda a, i: jnp.take_along_axis(a.reshape(4, 3), i.astype(int)[:, None], 1),
@@ -136,11 +153,13 @@ def test_an_unknown_primitive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty cache, without what this process has loaded."""
-    monkeypatch.setattr(compiled, "_FOLDER", tmp_path / "cache")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
     monkeypatch.setattr(compiled, "_LOADED", {})
-    return tmp_path / "cache"
+    compiled._folder.cache_clear()
+    yield tmp_path / ".cache/fusion-gym/compiled"
+    compiled._folder.cache_clear()
 
 
 def rewards(task: Task) -> np.ndarray:
@@ -161,8 +180,56 @@ def test_damaged_code_is_compiled_again(cache: Path) -> None:
 
 
 def test_a_cache_that_cannot_be_written_is_left_alone(cache: Path) -> None:
+    cache.parent.mkdir(parents=True)
     cache.write_text("a file")
-    assert rewards(fusion_gym.make_task(LINEAR, backend="compiled")).all()
+    with pytest.warns(UserWarning, match="each start compiles"):
+        assert rewards(fusion_gym.make_task(LINEAR, backend="compiled")).all()
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner")
+def test_code_that_others_may_write_is_not_run(cache: Path) -> None:
+    task = fusion_gym.make_task(LINEAR, backend="compiled")
+    expected, files = rewards(task), sorted(cache.iterdir())
+    for file in files:
+        file.write_bytes(hashlib.sha256(b"planted").digest() + b"planted")
+        file.chmod(0o666)
+    compiled._LOADED.clear()
+    np.testing.assert_array_equal(rewards(task), expected)
+    assert {file.stat().st_mode & 0o777 for file in files} == {0o600}
+    cache.chmod(0o777)
+    compiled._LOADED.clear()
+    compiled._folder.cache_clear()
+    with pytest.warns(UserWarning, match="is not the user's alone"):
+        np.testing.assert_array_equal(rewards(task), expected)
+
+
+def test_code_needs_no_home(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", home)
+    with pytest.warns(UserWarning, match="home directory"):
+        assert rewards(fusion_gym.make_task(LINEAR, backend="compiled")).all()
+
+
+def test_code_that_is_not_used_for_thirty_days_is_removed(cache: Path) -> None:
+    rewards(fusion_gym.make_task(LINEAR, backend="compiled"))
+    old, *others = sorted(cache.iterdir())
+    for file, days in ((old, 31), (others[0], 29)):
+        os.utime(file, (time.time() - days * 86_400,) * 2)
+    compiled._folder.cache_clear()
+    compiled._folder()
+    assert sorted(cache.iterdir()) == others
+
+
+def test_threads_make_and_step_one_environment(cache: Path) -> None:
+    task = fusion_gym.make_task(LINEAR, backend="compiled")
+    expected = rewards(task)
+    with ThreadPoolExecutor(3) as pool:
+        for _ in range(50):
+            compiled._LOADED.clear()
+            for result in pool.map(rewards, [task] * 3):
+                np.testing.assert_array_equal(result, expected)
 
 
 @pytest.mark.slow
