@@ -128,7 +128,8 @@ class Rule:
     A subclass declares ``knowledge``, the least knowledge class with all its signals, and returns
     requests (sensors, N) bool from ``__call__``. Parameters with a check (:func:`parameter`) are
     checked at construction. A rule with variables overrides ``reset``, which runs at construction
-    and before the first call.
+    and before the first call. A rule without variables and draws may declare ``stateless = True``;
+    its subclasses declare it again.
 
     Raises:
         ConfigurationError: a parameter that is not allowed.
@@ -141,12 +142,19 @@ class Rule:
         >>> @dataclass
         ... class EveryThird(Rule):
         ...     knowledge: ClassVar[str] = "clock"
+        ...     stateless: ClassVar[bool] = True
         ...
         ...     def __call__(self, signals):
         ...         return np.broadcast_to(signals["step"] % 3 == 0, shape_of(signals)).copy()
         >>> EveryThird().stateless
         True
     """
+
+    stateless: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        """Take ``stateless`` from the class itself, because its call may draw."""
+        cls.stateless = cls.__dict__.get("stateless", False)
 
     @property
     def knowledge(self) -> Knowledge:
@@ -159,11 +167,6 @@ class Rule:
             if (check := field.metadata.get("check")) and namespace(value) is np:
                 check(field.name, value)
         self.reset(0)
-
-    @property
-    def stateless(self) -> bool:
-        """Whether the rule has no variables, which means no :meth:`reset` of its class."""
-        return type(self).reset is Rule.reset
 
     def column(self, name: str, sensors: int) -> Array:
         """Return a parameter as (sensors, 1), from one number for all sensors or one for each."""

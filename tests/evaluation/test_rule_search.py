@@ -27,6 +27,7 @@ from fusion_gym.evaluation.rule_search import (
 )
 from fusion_gym.policies.base import Requests, Rule, shape_of
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.rules.measurements import InnovationThreshold
 from fusion_gym.validation import ConfigurationError
 
 pytest.importorskip("cmaes")
@@ -252,6 +253,14 @@ class EveryOtherStep(Rule):
         return np.full(shape_of(signals), self.steps % 2 == 0)
 
 
+@dataclasses.dataclass
+class Sometimes(InnovationThreshold):
+    """A rule that draws in its call, and declares nothing of it."""
+
+    def __call__(self, signals: Signals) -> Requests:
+        return super().__call__(signals) & (np.random.default_rng().random() < 0.5)
+
+
 @pytest.mark.parametrize(
     ("rule", "options"),
     [
@@ -268,6 +277,8 @@ def test_numpy_runs_what_the_loop_does_not(
     assert len(try_thresholds(task_of(**options), rule, [0.5, 1.0], 3, 0)) == 2
     alternating = [EveryOtherStep(number) for number in (1.0, 2.0)]
     assert rule_search._means(task_of(), alternating, 2, 0)[1] == pytest.approx(4.5)
+    drawing = [Sometimes(threshold) for threshold in (0.5, 1.0)]
+    assert len(rule_search._means(task_of(), drawing, 2, 0)[1]) == 2
 
 
 def test_coordinates_are_those_that_matter() -> None:

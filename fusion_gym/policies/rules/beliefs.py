@@ -1,7 +1,7 @@
 """Rules that use the beliefs of the scheduler or of each sensor."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -56,6 +56,7 @@ class ValueOfInformation(BeliefRule):
     threshold: float | None = parameter(None, check_price)
     price: float | None = parameter(None, check_price)
     at_most: int | None = parameter(None, check_at_most)
+    stateless: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -119,6 +120,7 @@ class EstimateDifference(BeliefRule):
     threshold: float = parameter(0.2, validation.number, at_least=0.0)
     whitened: bool = parameter(False, validation.boolean)
     at_most: int | None = parameter(1, check_at_most)
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -175,6 +177,7 @@ class KullbackLeibler(BeliefRule):
 
     threshold: float = parameter(0.5, validation.number, at_least=0.0)
     at_most: int | None = parameter(None, check_at_most)
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""

@@ -59,6 +59,8 @@ class InnovationThreshold(LocalRule):
     whitened: bool = parameter(False, validation.boolean)
     at_most: int | None = parameter(None, check_at_most)
 
+    stateless: ClassVar[bool] = True
+
     @property
     def knowledge(self) -> Knowledge:
         """The class of a sensor, or with ``at_most``, which compares sensors, of a scheduler."""
@@ -338,6 +340,7 @@ class SendOnDelta(LocalRule):
 
     threshold: PerSensor = parameter(1.0, not_negative_parameter)
     knowledge: ClassVar[Knowledge] = "own"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -381,6 +384,7 @@ class ReportOnChange(LocalRule):
     reportable_change: PerSensor = parameter(1.0, not_negative_parameter)
     percent: bool = parameter(False, validation.boolean)
     knowledge: ClassVar[Knowledge] = "own"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""

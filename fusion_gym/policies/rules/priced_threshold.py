@@ -100,6 +100,7 @@ class PricedThreshold(BeliefRule):
     margin: float = parameter(1.0, validation.number, at_least=1.0)
     margin_exponent: float = parameter(0.0, validation.number)
     together: ClassVar[tuple[str, ...]] = ("margin", "margin_exponent")
+    stateless: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.score == "variance":

@@ -39,6 +39,7 @@ class Always(Rule):
     """
 
     knowledge: ClassVar[Knowledge] = "clock"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return requests of all sensors (sensors, N)."""
@@ -63,6 +64,7 @@ class Never(Rule):
     """
 
     knowledge: ClassVar[Knowledge] = "clock"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return no requests (sensors, N)."""
@@ -97,6 +99,7 @@ class Periodic(Rule):
     period: int = parameter(4, validation.integer, at_least=1, at_most=validation.MOST_PERIOD)
     staggered: bool = parameter(True, validation.boolean)
     knowledge: ClassVar[Knowledge] = "clock"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -131,6 +134,7 @@ class RoundRobin(Rule):
 
     period: int = parameter(1, validation.integer, at_least=1, at_most=validation.MOST_PERIOD)
     knowledge: ClassVar[Knowledge] = "clock"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -207,6 +211,7 @@ class Paced(Rule):
     rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)
     staggered: bool = parameter(True, validation.boolean)
     knowledge: ClassVar[Knowledge] = "clock"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -249,6 +254,7 @@ class LocalVariance(Rule):
     m: PerSensor = parameter(0.9, each_number)
     reference: float = parameter(0.0, validation.number, at_least=0.0)
     knowledge: ClassVar[Knowledge] = "centre"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -293,6 +299,7 @@ class CentreVariance(Rule):
     threshold: float = parameter(1.6, validation.number, at_least=0.0)
     at_most: int | None = parameter(None, check_at_most)
     knowledge: ClassVar[Knowledge] = "centre"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -332,6 +339,7 @@ class VarianceThreshold(Rule):
     threshold: float = parameter(0.1, validation.number, at_least=0.0)
     at_most: int | None = parameter(1, check_at_most)
     knowledge: ClassVar[Knowledge] = "centre"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -370,6 +378,7 @@ class MaximumAge(Rule):
     at_most: int | None = parameter(1, check_at_most)
     least: float = parameter(1.0, validation.number, at_least=1.0)
     knowledge: ClassVar[Knowledge] = "centre"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
@@ -409,6 +418,7 @@ class InformationGain(Rule):
     threshold: float = parameter(0.05, validation.number, at_least=0.0)
     at_most: int | None = parameter(1, check_at_most)
     knowledge: ClassVar[Knowledge] = "centre"
+    stateless: ClassVar[bool] = True
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
