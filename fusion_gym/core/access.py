@@ -84,9 +84,11 @@ ACCESS: dict[str, AccessRow] = {
 
 def check_requests(requests: NDArray[Any], channels: int) -> None:
     """Check that requests are bool or numbers of channels, 0 for silence; JAX checks nothing."""
-    if requests.dtype == np.bool_ or not isinstance(requests, np.ndarray):
+    kind = getattr(requests, "dtype", None)
+    if kind == np.bool_ or (kind is not None and not isinstance(requests, np.ndarray)):
         return
-    if requests.dtype.kind not in "iu" or not np.all((requests >= 0) & (requests <= channels)):
+    whole = kind is not None and kind.kind in "iu" and channels > 0
+    if not whole or not np.all((requests >= 0) & (requests <= channels)):
         allowed = f"bool, or with access='assignment' channels from 1 to {channels} and 0"
         allowed = allowed if channels else "bool, because this access assigns no channels"
         raise refusal("requests", requests, allowed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,7 @@ class EpisodeBatch(Runs):
     """
 
     reference_error: Array
+    lost: NDArray[np.bool_] | None = None  # runs (N,) that diverged, which begin anew; None raises
 
     def __init__(
         self,
@@ -178,6 +179,8 @@ class EpisodeBatch(Runs):
         """
         if self._state is None:
             raise RuntimeError("call reset before the first step")
+        network = self.task.network
+        check_requests(requests, network.slots * network.rule.by_channel)
         if self._program is not None:
             outcome = self._run_program(requests, run)
         else:
@@ -187,8 +190,7 @@ class EpisodeBatch(Runs):
             estimate = self.delivered.estimate
             covariance = self.task.estimator.covariance(estimate)
             mean = self.task.estimator.mean(estimate)
-            values = {"covariance": covariance, "mean": mean, "truth": outcome.error}
-            require_finite(values, self.finished, self.steps)
+            self._lose({"covariance": covariance, "mean": mean, "truth": outcome.error})
         if self.reference is not None:
             self._refer(self.reference)
         if self._program is None:
@@ -199,7 +201,17 @@ class EpisodeBatch(Runs):
             measurement = self.task.plant.measurement(self.state.plant)
             self._full_state = self.reference.observe(predicted, measurement)
         self.finished = np.array(outcome.ended, ndmin=1)
+        if self.lost is not None and not np.isfinite(outcome.error[..., self.lost]).all():
+            self.reset(np.flatnonzero(self.lost & ~self.finished))
         return outcome
+
+    def _lose(self, values: Mapping[str, Array]) -> None:
+        """Note the unfinished runs with a value (…, N) that is not finite, or raise an error."""
+        if self.lost is None:
+            require_finite(values, self.finished, self.steps)
+            return
+        for value in values.values():
+            self.lost |= ~np.isfinite(value).reshape(-1, self.num_envs).all(0) & ~self.finished
 
     def observe(self, local: bool = False) -> NDArray[np.float32]:
         """Return observations (N, entries); NaN in an unfinished run is a ``DivergenceError``."""
@@ -210,7 +222,8 @@ class EpisodeBatch(Runs):
         if not math.isfinite(np.vdot(observation, observation)):
             entry = np.isnan(observation).argmax(1)  # first NaN of each run
             values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}
-            require_finite(values, self.finished, self.steps)
+            self._lose(values)
+            observation = observation if self.lost is None else np.nan_to_num(observation)
         return observation
 
     def normals(self) -> Array:
@@ -244,9 +257,6 @@ class EpisodeBatch(Runs):
 
     def _run_program(self, requests: NDArray[Any], run: int | None) -> Outcome:
         """Make both halves of a step by the backend's program."""
-        if requests.dtype != np.bool_:
-            network = self.task.network
-            check_requests(requests, network.slots * network.rule.by_channel)
         rows, program = self._packed(), self._program
         self.steps = self.steps + _ONE
         self._move()

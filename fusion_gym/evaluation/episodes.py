@@ -28,6 +28,9 @@ BATCH = 1024  # episodes in one batch; fixed, so that results do not depend on t
 class EpisodeResults:
     """The results of E episodes of H steps; most fields are averages over an episode's steps.
 
+    An episode in which the estimate is not finite is lost: its values are NaN, and its cost is
+    infinite.
+
     Args:
         mse: squared error of the fused estimate (E,), summed over states.
         error_cost: error in the units of the reward (E,), >= 0.
@@ -40,7 +43,8 @@ class EpisodeResults:
         denied: requests that the network refused (E,), summed over sensors.
         returns: sum of the rewards (E,).
         diverged: share of diverged steps (E,).
-        squared_error: squared error (H, n) at each time and state, averaged over episodes.
+        squared_error: squared error (H, n) at each time and state, averaged over the episodes that
+            are not lost by then.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
@@ -70,7 +74,7 @@ class EpisodeResults:
 
     def cost(self, price: float | Array) -> Array:
         """Return error + price · tokens (E,), for one price of a token or one per episode (E,)."""
-        return self.error_cost + price * self.tokens
+        return np.nan_to_num(self.error_cost + price * self.tokens, nan=np.inf)
 
 
 def run_episodes(
@@ -222,10 +226,12 @@ def _results(
     means = {name: np.zeros(runs) for name in _MEANS}
     rate, requests = np.zeros((sensors, runs)), np.zeros((sensors, runs))
     returns, squared_error = np.zeros(runs), []
+    batch.lost = lost = np.zeros(runs, dtype=np.bool_)
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
         covariance = task.estimator.covariance(batch.delivered.estimate)
-        squared_error.append(outcome.squared_error.reshape(-1, parts, episodes).mean(-1))
+        errors = np.where(lost, 0.0, outcome.squared_error).reshape(-1, parts, episodes).sum(-1)
+        squared_error.append(errors / (~lost).reshape(parts, episodes).sum(-1))
         for name, mean in _MEANS.items():
             means[name] += mean(_Step(batch, outcome, covariance))
         rate += outcome.granted
@@ -235,6 +241,8 @@ def _results(
             progress(runs)
     values = {name: total / horizon for name, total in means.items()}
     values |= {"rate": (rate / horizon).T, "requests": (requests / horizon).T, "returns": returns}
+    for value in values.values():
+        value[lost] = np.nan
     paths = np.moveaxis(np.array(squared_error), -1, 0)
     return [
         EpisodeResults(

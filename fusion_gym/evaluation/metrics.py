@@ -9,8 +9,8 @@ import numpy as np
 from fusion_gym.arrays import Array
 from fusion_gym.docstrings import table
 from fusion_gym.entries import Plain
+from fusion_gym.errors import ConfigurationError, DivergenceError
 from fusion_gym.evaluation.episodes import EpisodeResults
-from fusion_gym.validation import ConfigurationError
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -39,9 +39,10 @@ class Interval(NamedTuple):
 def mean_interval(samples: Array, seed: int = 0) -> Interval:
     """Return the mean of samples with its 95 % percentile bootstrap interval.
 
-    A single sample, or equal samples, give the interval [mean, mean]. A warning says that the
-    largest 1 % of the samples have more than a fifth of their sum: the tail is heavy, and the
-    interval may lie far below the expectation.
+    A single sample, or equal samples, give the interval [mean, mean]. NaN, the value of a lost
+    episode, is left out with a warning. Another warning says that the largest 1 % of the samples
+    have more than a fifth of their sum: the tail is heavy, and the interval may lie far below the
+    expectation.
 
     Args:
         samples: one value per episode (E,).
@@ -56,6 +57,13 @@ def mean_interval(samples: Array, seed: int = 0) -> Interval:
         >>> mean_interval(np.arange(10.0))
         Interval(mean=4.5, low=2.7, high=6.3)
     """
+    lost = np.isnan(samples)
+    if lost.all():
+        raise DivergenceError(f"all {len(samples)} episodes diverged: there is no mean")
+    if lost.any():
+        text = f"{lost.sum()} of {len(samples)} episodes diverged: the mean is that of the others"
+        warnings.warn(text, stacklevel=2)
+        samples = samples[~lost]
     mean = float(np.mean(samples))
     if len(samples) < 2 or float(np.ptp(samples)) == 0.0:
         return Interval(mean, mean, mean)
@@ -106,7 +114,7 @@ class Metric(NamedTuple):
     def summary(self, name: str, results: EpisodeResults) -> Any:
         """Return the metric's interval, or its means along its axis."""
         result = self.samples(results) if self.samples else getattr(results, name)
-        return result.mean(0).tolist() if self.axis else mean_interval(result)._asdict()
+        return np.nanmean(result, 0).tolist() if self.axis else mean_interval(result)._asdict()
 
 
 METRICS = {
@@ -173,8 +181,8 @@ def robust_summary(results: EpisodeResults) -> dict[str, float]:
         results: results of the policy.
 
     Returns:
-        The quantiles ``q05``, ``q25``, ``median``, ``q75`` and ``q95``, and the share ``diverged``
-        of diverged steps.
+        The quantiles ``q05``, ``q25``, ``median``, ``q75`` and ``q95``, the share ``diverged`` of
+        diverged steps, and the share ``lost`` of lost episodes, whose MSE counts as infinite.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
@@ -184,8 +192,10 @@ def robust_summary(results: EpisodeResults) -> dict[str, float]:
         0.0
     """
     names = {"q05": 0.05, "q25": 0.25, "median": 0.5, "q75": 0.75, "q95": 0.95}
-    quantiles = {name: float(np.quantile(results.mse, level)) for name, level in names.items()}
-    return quantiles | {"diverged": float(results.diverged.mean())}
+    mse = np.nan_to_num(results.mse, nan=np.inf)
+    quantiles = {name: float(np.quantile(mse, level)) for name, level in names.items()}
+    diverged = float(np.nan_to_num(results.diverged, nan=1.0).mean())
+    return quantiles | {"diverged": diverged, "lost": float(np.isnan(results.mse).mean())}
 
 
 def paired_difference(results: EpisodeResults, reference: EpisodeResults) -> Interval:

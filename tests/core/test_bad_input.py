@@ -11,6 +11,7 @@ from refusals import refused
 from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task, parallel_env
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import present_id
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
@@ -332,3 +333,15 @@ def test_finished_runs_must_be_reset_when_autoreset_is_disabled() -> None:
     refused(lambda: env.step(nothing), "[0, 2]", "reset_mask", kind=ResetNeeded)
     env.reset(options={"reset_mask": np.array([True, False, False])})
     refused(lambda: env.step(nothing), "[2]", kind=ResetNeeded)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "compiled", "jax"])
+@pytest.mark.parametrize("kind", [int, float, object, list], ids=lambda kind: kind.__name__)
+def test_requests_of_another_kind_move_nothing(backend: str, kind: Any) -> None:
+    task = make_task("fusion_gym/RemoteEstimation-v1", backend=backend)
+    batch = EpisodeBatch.seeded(task, 2, 0)
+    before, steps = batch.observe().copy(), batch.steps.copy()
+    requests = [[False, False]] if kind is list else np.zeros((1, 2), kind)
+    refused(lambda: batch.step(requests), "requests = [[", "it must be bool")
+    np.testing.assert_array_equal(batch.observe(), before)
+    np.testing.assert_array_equal(batch.steps, steps)

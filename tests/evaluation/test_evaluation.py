@@ -12,13 +12,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from linear_case import Linear
 from refusals import refused
 
 from fusion_gym import ConfigurationError, make_task
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import ENVIRONMENTS
+from fusion_gym.errors import DivergenceError
 from fusion_gym.evaluation.envelope import compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode, run_episodes
-from fusion_gym.evaluation.metrics import METRICS, mean_interval, paired_difference, summarise
+from fusion_gym.evaluation.metrics import (
+    METRICS,
+    mean_interval,
+    paired_difference,
+    robust_summary,
+    summarise,
+)
 from fusion_gym.policies.registry import make_policy
 
 ENV_ID = "fusion_gym/TobitOscillator-v1"
@@ -261,3 +271,41 @@ def test_a_heavy_tail_is_warned_of() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mean_interval(rng.exponential(size=1000))
+
+
+class Breaking(Linear):
+    """A plant that ends where its noise is large."""
+
+    most = np.inf
+
+    def move(self, state: Any, noise: Any) -> Any:
+        return np.where(noise[0] > self.most, np.inf, super().move(state, noise))
+
+
+def test_runs_that_diverge_leave_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their share is reported, and means name them; alone such a run has none."""
+
+    def build(options: CommonOptions) -> Scenario:
+        return Scenario(options, (system := Breaking()).plant, system.estimator)
+
+    monkeypatch.setitem(ENVIRONMENTS, "me/Breaking-v0", build)
+    task = make_task("me/Breaking-v0", horizon=20)
+    whole = evaluate(task, "periodic:period=2", 200)
+    monkeypatch.setattr(Breaking, "most", 3.2)
+    with np.errstate(invalid="ignore"):
+        results = evaluate(task, "periodic:period=2", 200)
+    lost = np.isnan(results.mse)
+    assert 0 < lost.sum() < 10
+    for name in ("mse", "returns", "rate", "nees"):
+        one, other = (getattr(result, name) for result in (results, whole))
+        np.testing.assert_array_equal(one[~lost], other[~lost])
+        assert np.isnan(one[lost]).all()
+    assert np.isinf(results.cost(0.1)[lost]).all()
+    assert robust_summary(results)["lost"] == lost.mean()
+    assert np.isfinite(results.squared_error).all()
+    with pytest.warns(UserWarning, match=f"{lost.sum()} of 200 episodes diverged"):
+        summary = summarise(results)
+    assert summary["mse"]["mean"] == pytest.approx(whole.mse[~lost].mean())
+    with np.errstate(invalid="ignore"):
+        alone = evaluate(task, "always", 1, 10 + int(lost.argmax()))
+    refused(lambda: summarise(alone), "all 1 episodes diverged", kind=DivergenceError)
