@@ -36,15 +36,15 @@ class NeedsTrust(ConfigurationError):
     """A file that plain JSON and weights cannot restore; only its own code could load it."""
 
 
-def read_plain(file: Path) -> Plain:
-    """Return the archive's ``data``, with pickled entries as text."""
-    content = read_part(file, "data")
+def read_plain(file: Path, name: str = "data") -> Plain:
+    """Return a JSON object of the archive, with pickled entries as text."""
+    content = read_part(file, name)
     try:
         data = json.loads(content)
     except (ValueError, RecursionError):
-        raise _none("its data is not JSON") from None
+        raise _none(f"its {name} is not JSON") from None
     if not isinstance(data, dict):
-        raise _none("its data is not a JSON object")
+        raise _none(f"its {name} is not a JSON object")
     return data
 
 

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals, least_covering
 from fusion_gym.core.task import Task
-from fusion_gym.policies.archive import read_part
+from fusion_gym.policies.archive import read_part, read_plain
 from fusion_gym.policies.base import Requests, Stateless
 from fusion_gym.policies.loading import load_model_policy
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.priced_threshold import PricedThreshold
-from fusion_gym.validation import ConfigurationError, refusal
+from fusion_gym.validation import ConfigurationError, entries, integer, keys, number, refusal
 
 CALIBRATION = "calibration.json"  # the part of the archive that marks a calibrated policy
 
@@ -165,18 +165,43 @@ def save_calibrated(
             archive.writestr(zipfile.ZipInfo(name), part, zipfile.ZIP_DEFLATED)
 
 
+def read_calibration(file: Path) -> tuple[str, list[float], list[CalibrationPoint]]:
+    """Return rule, slopes and points of a file's calibration.
+
+    Raises:
+        ConfigurationError: the file has no calibration, or a value is not allowed.
+    """
+    content = read_plain(file, CALIBRATION)
+    keys(f"entry of {CALIBRATION}", content, ("rule", "slopes", "points"))
+    rule, slopes, rows = (content.get(name) for name in ("rule", "slopes", "points"))
+    if not isinstance(rule, str):
+        raise refusal("rule", rule, "a text")
+    slopes = [number("slopes", b, above=0.0) for b in entries("slopes", slopes, "a slope", "agent")]
+    points: list[CalibrationPoint] = []
+    for row in entries("points", rows, "a calibration", "price"):
+        if not isinstance(row, dict) or row.keys() != {*CalibrationPoint._fields}:
+            raise refusal("points", row, f"an object with {', '.join(CalibrationPoint._fields)}")
+        least = points[-1].price if points else 0.0
+        points.append(
+            CalibrationPoint(
+                number("price", row["price"], above=least),
+                integer("agent", row["agent"], at_least=0, at_most=len(slopes) - 1),
+                number("mixture", row["mixture"], at_least=0.0, at_most=1.0),
+                number("threshold", row["threshold"]),
+            )
+        )
+    return rule, slopes, points
+
+
 def agent_files(path: Path, folder: Path) -> list[Path]:
     """Return the files of a policy's agents: its own, or the calibrated agents in a folder."""
     try:
-        content = read_part(path, CALIBRATION)
+        read_part(path, CALIBRATION)
     except ConfigurationError:
         return [path]
-    try:
-        count = len(json.loads(content)["slopes"])
-    except (LookupError, TypeError, ValueError) as error:
-        raise ConfigurationError(f"its calibration cannot be read: {error}") from None
+    _, slopes, _ = read_calibration(path)
     place = Path(tempfile.mkdtemp(dir=folder))
-    files = [place / f"agent_{number}.zip" for number in range(count)]
+    files = [place / f"agent_{agent}.zip" for agent in range(len(slopes))]
     for file in files:
         file.write_bytes(read_part(path, file.name))
     return files
@@ -188,18 +213,8 @@ def load_calibrated(path: Path, task: Task, price: float | None, trust: bool) ->
     Raises:
         ConfigurationError: a part is missing, or a value is not allowed.
     """
-    try:
-        content = json.loads(read_part(path, CALIBRATION))
-        points = [CalibrationPoint(**point) for point in content["points"]]
-        slopes = [float(slope) for slope in content["slopes"]]
-        numbers = np.array(points, dtype=np.float64)
-        sound = np.isfinite(numbers).all() and (np.diff(numbers[:, 0]) > 0.0).all()
-        known = set(numbers[:, 1]) <= set(range(len(slopes)))
-        if not (sound and known and 0.0 < min(slopes) <= max(slopes) < np.inf):
-            raise ValueError("its numbers are not allowed")
-        rule = calibration_rule(str(content["rule"]), task)
-    except (LookupError, TypeError, ValueError) as error:
-        raise ConfigurationError(f"its calibration cannot be read: {error}") from None
+    text, slopes, points = read_calibration(path)
+    rule = calibration_rule(text, task)
     rule.price = rule.price if price is None else price
     with tempfile.TemporaryDirectory() as folder:
         files = map(str, agent_files(path, Path(folder)))

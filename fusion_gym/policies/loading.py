@@ -76,16 +76,19 @@ def load_model_policy(
     return policy
 
 
-def _statistics(path: str, view: View, trust: bool) -> VecNormalize:
-    """Return the statistics of VecNormalize, whose file runs any code in it."""
+def _statistics(path: str, view: View, trust: bool) -> VecNormalize | None:
+    """Return the statistics of VecNormalize, by code of the file; ``None`` of rewards alone."""
     if not trust:
         raise validation.refusal("normalize", path, "given with --trust: it is a pickle")
     try:
         statistics = pickle.loads(Path(path).read_bytes())
     except Exception as error:  # a pickle raises errors of any class
         raise validation.refusal("normalize", path, f"a readable file ({error})") from None
-    shape = getattr(getattr(statistics, "obs_rms", None), "mean", np.empty(0)).shape
-    if not isinstance(statistics, VecNormalize) or shape != view.space.shape:
+    content = vars(statistics) if isinstance(statistics, VecNormalize) else {}
+    if content.get("norm_obs") is False:
+        return None
+    moments = [np.asarray(getattr(content.get("obs_rms"), name, "")) for name in ("mean", "var")]
+    if any(m.shape != view.space.shape or not np.isfinite(m).all() for m in moments):
         raise validation.refusal("normalize", path, f"statistics of shape {view.space.shape}")
     return statistics
 

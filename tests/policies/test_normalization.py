@@ -21,11 +21,16 @@ ENV = "fusion_gym/LinearFusion-v2"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an agent and its statistics, and with statistics of another environment."""
     folder = tmp_path_factory.mktemp("normalized")
-    for name, options in (("agent", {}), ("other", {"memory": True})):
+    for name, options in (("other", {"memory": True}), ("agent", {})):
         envs = VecNormalize(fusion_gym.make_sb3_vec_env(ENV, 8, seed=0, **options))
         model = PPO("MlpPolicy", envs, n_steps=16, batch_size=128, seed=0).learn(256)
         model.save(folder / f"{name}.zip")
         envs.save(str(folder / f"{name}.pkl"))
+    envs.obs_rms.mean = envs.obs_rms.mean * np.nan
+    envs.save(str(folder / "damaged.pkl"))
+    envs = VecNormalize(fusion_gym.make_sb3_vec_env(ENV, 8, seed=0), norm_obs=False)
+    PPO("MlpPolicy", envs, n_steps=16, batch_size=128).learn(128).save(folder / "rewards.zip")
+    envs.save(str(folder / "rewards.pkl"))
     (folder / "text.pkl").write_text("no pickle")
     return folder
 
@@ -56,6 +61,7 @@ def test_the_agent_sees_what_it_saw_in_training(folder: Path, task: Task) -> Non
         (",normalize={folder}/absent.pkl", True, "a readable file"),
         (",normalize={folder}/text.pkl", True, "a readable file"),
         (",normalize={folder}/other.pkl", True, "statistics of shape"),
+        (",normalize={folder}/damaged.pkl", True, "statistics of shape"),
     ],
 )
 def test_an_agent_without_its_statistics_is_refused(
@@ -64,6 +70,13 @@ def test_an_agent_without_its_statistics_is_refused(
     text = f"model:{folder / 'agent.zip'}{settings.format(folder=folder)}"
     with pytest.raises(ConfigurationError, match=message):
         fusion_gym.make_policy(text, task, trust=trust)
+
+
+def test_an_agent_of_normalized_rewards_sees_the_observation(folder: Path, task: Task) -> None:
+    text = f"model:{folder / 'rewards.zip'},normalize={folder / 'rewards.pkl'}"
+    agent: Any = fusion_gym.make_policy(text, task, trust=True)
+    batch = EpisodeBatch.seeded(task, 4, 0)
+    np.testing.assert_array_equal(agent.rows(batch.signals()), batch.observe())
 
 
 def test_no_file_has_the_statistics(folder: Path, task: Task, tmp_path: Path) -> None:

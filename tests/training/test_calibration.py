@@ -212,11 +212,13 @@ def test_an_evaluation_draws_no_actions_of_a_calibrated_policy(tmp_path: Path, p
 POINT = {"price": 0.3, "agent": 0, "mixture": 0.0, "threshold": 0.0}
 
 
-@pytest.mark.parametrize("content", ["[1]", "{}", '{"slopes": 1}', "no JSON"])
+@pytest.mark.parametrize(
+    "content", ["[1]", "{}", '{"slopes": 1}', "no JSON", "[" * 100_000, '{"a": 1}'], ids=range(6)
+)
 def test_agents_of_a_file_with_other_content_are_refused(tmp_path: Path, content: str) -> None:
     with zipfile.ZipFile(tmp_path / "policy.zip", "w") as archive:
         archive.writestr("calibration.json", content)
-    with pytest.raises(ConfigurationError, match="its calibration cannot be read"):
+    with pytest.raises(ConfigurationError, match=r"is not|unknown entry of calibration\.json"):
         agent_files(tmp_path / "policy.zip", tmp_path)
 
 
@@ -227,6 +229,12 @@ def test_agents_of_a_file_with_other_content_are_refused(tmp_path: Path, content
         {"points": [POINT, POINT]},
         {"points": [POINT | {"agent": 1}]},
         {"points": [POINT | {"threshold": float("nan")}]},
+        {"points": [POINT | {"price": 10**400}]},
+        {"points": [POINT | {"price": "0.3"}]},
+        {"points": [POINT | {"price": -1.0}]},
+        {"points": [POINT | {"mixture": 7.0}]},
+        {"points": 3},
+        {"slopes": ["1.0"]},
         {"points": [{"price": 0.3}]},
         {"slopes": []},
         {"slopes": [-1.0]},
@@ -240,8 +248,11 @@ def test_a_file_with_other_content_is_refused(tmp_path: Path, content: Any, part
     with zipfile.ZipFile(tmp_path / "policy.zip", "w") as archive:
         archive.writestr("calibration.json", json.dumps(right | content))
         archive.write(saved(agent, tmp_path), "agent_0.zip")
-    with pytest.raises(ConfigurationError, match="its calibration cannot be read"):
+    with pytest.raises(
+        ConfigurationError, match=r"model .* is not allowed: \w+ = .* is not allowed: it must be"
+    ) as caught:
         make_policy(f"model:{tmp_path / 'policy.zip'}", task)
+    assert "\n" not in str(caught.value)
 
 
 def test_agents_without_a_logit_a_sensor_are_refused(parts: Any) -> None:
