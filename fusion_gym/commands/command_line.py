@@ -56,8 +56,9 @@ class Command(ABC):
             sys.path.append(os.getcwd())
         with report_errors(lambda: command.interrupted() if command else "interrupted"):
             command = read_command(cls)
+            words = {word.replace("-", "_") for word in sys.argv}
             for item in fields(command):
-                if f"--{item.name}" in sys.argv and getattr(command, item.name) == ():
+                if f"__{item.name}" in words and getattr(command, item.name) == ():
                     raise refusal(item.name, (), "one value or more")
             with (
                 trust_files(getattr(command, "trust", False)),

@@ -159,3 +159,9 @@ def test_what_is_no_literal_stays_text(text: str) -> None:
 def test_braces_of_a_swept_policy_are_its_own() -> None:
     curve = SweepCurve(label="a", policy="p:a={value},b={0}{other}", values=(1, 2.5))
     assert curve.policies(Price.create(0.5)) == ["p:a=1,b={0}{other}", "p:a=2.5,b={0}{other}"]
+
+
+@pytest.mark.parametrize("option", ["--error-code", "--error_code", "--channels"])
+def test_an_option_without_a_value_is_refused(option: str, here: Path) -> None:
+    message = refusal("fit", ["tanks", "--output", "plant.yaml", option])
+    assert message.startswith(f"error: {option[2:].replace('-', '_')} = () is not allowed")

@@ -149,7 +149,10 @@ NETWORKS: dict[str, list[Options]] = {
     ],
     "TobitOscillator": [{"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE],
     "MarkovJumpTracking": [{"channel": "independent", "acknowledgements": 0.4}],
-    "UnknownInput": [{"channel": "independent", "acknowledgements": "none"} | SCARCE],
+    "UnknownInput": [
+        {"channel": "independent", "acknowledgements": "none"} | SCARCE,
+        {"intersample_error": True, "delay": 1, "budget": "sensor"} | SCARCE,
+    ],
     "RemoteEstimation": [
         {"sensors": 2, "channel": "independent", "acknowledgements": 0.5, "memory": True},
         {"sensors": 3, "access": "collision", "channels": 2},

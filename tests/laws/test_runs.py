@@ -1,5 +1,6 @@
 """Laws of runs: the noise, the batch, branches, and what an observation holds."""
 
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -72,6 +73,15 @@ def test_a_run_is_the_same_by_itself_and_in_a_batch(case: Case) -> None:
             batch.reset(np.flatnonzero(begin))
         if begin[run]:
             visible, _ = env.reset()
+
+
+@each_case
+def test_a_pickled_batch_steps_as_the_batch(case: Case) -> None:
+    batch = case.batch(3)
+    other = pickle.loads(pickle.dumps(batch))
+    for request in requests(batch.task, 3, 2):
+        for first, second in zip(batch.step(request), other.step(request), strict=True):
+            np.testing.assert_array_equal(first, second)
 
 
 @pytest.mark.parametrize("owner", ["scheduler", "own"])

@@ -214,3 +214,18 @@ def test_an_index_by_channel_beats_rules_without_channels() -> None:
     for better, worse in pairwise(returns):
         gain = better - worse
         assert gain.mean() > 3.0 * gain.std() / 200**0.5
+
+
+def test_the_index_is_compared_with_the_price_of_each_sensors_packet() -> None:
+    """As in tasks in which all packets cost one token, at the price of that sensor's."""
+    costs, price = (1.0, 2.5, 4.0), 0.8
+    tasks = [make(3, access="any", tokens="unlimited", token_cost=cost) for cost in (costs, 1.0)]
+    batch = EpisodeBatch.seeded(tasks[0], 30, 0)
+    for step in range(6):
+        signals = batch.signals()
+        requests = make_policy(f"age_index:price={price}", tasks[0])(signals)
+        for sensor, cost in enumerate(costs):
+            other = make_policy(f"age_index:price={price * cost}", tasks[1])
+            np.testing.assert_array_equal(requests[sensor], other(signals)[sensor])
+        batch.step(np.arange(3)[:, None] == (step + np.arange(30)) % 3)
+    assert 0.0 < requests.mean() < 1.0

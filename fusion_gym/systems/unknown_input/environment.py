@@ -286,12 +286,20 @@ def _intersample(options: Any, weights: Array) -> Any:
     steps, size = [np.eye(len(small), len(weights))], len(small)
     for _ in range(1, options.sampling_period):
         steps.append(small @ steps[-1] + np.pad(inputs, ((0, 0), (size, 0))))
+    return _IntersampleCost(np.array(steps), weights)
 
-    def cost(error: Array, covariance: Array) -> Array:
-        states = np.square(np.array(steps) @ error).mean(0)
-        return weights @ np.concatenate((states, np.square(error[size:])))
 
-    return cost
+@dataclass(frozen=True)
+class _IntersampleCost:
+    """Mean weighted square of the small steps' errors, from those (n, N) of state and input."""
+
+    steps: Array
+    weights: Array
+
+    def __call__(self, error: Array, covariance: Array) -> Array:
+        states = np.square((self.steps[..., None] * error).sum(2)).mean(0)
+        parts = np.concatenate((states, np.square(error[len(states) :])))
+        return (self.weights[:, None] * parts).sum(0)
 
 
 def _with_example(options: UnknownInputOptions) -> Any:
