@@ -92,8 +92,10 @@ class Channel:
         if np.any(matrix < 0.0) or not np.allclose(matrix.sum(1), 1.0, rtol=0.0, atol=1e-9):
             reason = "it must have rows of probabilities that sum to 1"
             raise forbidden("channel_transition", matrix, reason)
-        pair = validation.array("drop_probability", drop_probability, (2,))
-        drop = _probabilities("drop_probability", pair, (2,))
+        if validation.array_shape(drop_probability) != (2,):
+            allowed = "a pair of probabilities (bad, good)"
+            raise validation.refusal("drop_probability", drop_probability, allowed)
+        drop = _probabilities("drop_probability", drop_probability, (2,))
         if initial == "stationary":
             leaves = matrix[[0, 1], [1, 0]]
             if leaves.sum() == 0.0:

@@ -30,7 +30,7 @@ def folder_of(kind: str) -> Path | None:
     return folder
 
 
-def read(folder: Path | None, key: str) -> bytes | None:
+def read_code(folder: Path | None, key: str) -> bytes | None:
     """Return the whole content of a file of the user, or ``None``; it counts as used now."""
     with contextlib.suppress(OSError):
         if folder is not None and _own(file := folder / key):
@@ -41,7 +41,7 @@ def read(folder: Path | None, key: str) -> bytes | None:
     return None
 
 
-def write(folder: Path | None, key: str, content: bytes) -> None:
+def write_code(folder: Path | None, key: str, content: bytes) -> None:
     """Store the content of a file, with its hash, where there is a folder."""
     with contextlib.suppress(OSError):
         if folder is not None:

@@ -166,18 +166,18 @@ def compile_function(
 def _machine_code(task: Any, source: Callable[[], str]) -> tuple[Any, int]:
     """Return engine and address of code from this process, the cache, or compiled of its assembly.
 
-    The cache has the code of a task and that of an assembly, which other sources may share.
+    The cache has the code of a task, and the code of an assembly, which other sources may share.
     """
     name = _fingerprint(task)
     if name in _LOADED:
         return _LOADED[name]
-    code = name and code_cache.read(_folder(), name)
+    code = name and code_cache.read_code(_folder(), name)
     if not code:
         text = source()
         key = hashlib.sha256(f"{_surroundings()}{text}".encode()).hexdigest()
-        code = code_cache.read(_folder(), key) or _compile(text)
+        code = code_cache.read_code(_folder(), key) or _compile(text)
         for file in filter(None, (name, key)):
-            code_cache.write(_folder(), file, code)
+            code_cache.write_code(_folder(), file, code)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(jit=True))
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()

@@ -74,7 +74,8 @@ class EpisodeResults:
 
     def cost(self, price: float | Array) -> Array:
         """Return error + price · tokens (E,), for one price of a token or one per episode (E,)."""
-        return np.nan_to_num(self.error_cost + price * self.tokens, nan=np.inf)
+        cost = self.error_cost + price * self.tokens
+        return np.where(np.isnan(cost), np.inf, cost)
 
 
 def run_episodes(

@@ -192,7 +192,7 @@ def robust_summary(results: EpisodeResults) -> dict[str, float]:
         0.0
     """
     names = {"q05": 0.05, "q25": 0.25, "median": 0.5, "q75": 0.75, "q95": 0.95}
-    mse = np.nan_to_num(results.mse, nan=np.inf)
+    mse = np.where(np.isnan(results.mse), np.inf, results.mse)
     quantiles = {name: float(np.quantile(mse, level)) for name, level in names.items()}
     diverged = float(np.nan_to_num(results.diverged, nan=1.0).mean())
     return quantiles | {"diverged": diverged, "lost": float(np.isnan(results.mse).mean())}

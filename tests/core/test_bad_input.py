@@ -158,7 +158,7 @@ OPTIONS: list[tuple[Any, ...]] = [
     (CORRELATED, {"action": "assignment"}, "action = 'assignment'", "access='any'"),
     (CORRELATED, QUALITIES | PAIRS | {"channels": 3, "channel": "independent"}, "shape (3, 3)"),
     (CORRELATED, QUALITIES | {"channel": "independent"}, "shape (1, 3)"),
-    (CORRELATED, QUALITIES | PAIRS | GILBERT_ELLIOTT, "shape (2,)"),
+    (CORRELATED, QUALITIES | PAIRS | GILBERT_ELLIOTT, "a pair of probabilities"),
     (TOBIT, {"own_number": 1}, "own_number = 1 "),
 ]
 

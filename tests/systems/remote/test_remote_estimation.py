@@ -56,7 +56,7 @@ def test_simple_channels_and_certain_starts() -> None:
     assert lost[0].mean() == pytest.approx(0.1, abs=0.01)
     assert lost[1].all()
     for number, name in enumerate(("bad", "good")):
-        channel = Channel.gilbert_elliott(((0.5, 0.5), (0.5, 0.5)), 0.1, 2, name)
+        channel = Channel.gilbert_elliott(((0.5, 0.5), (0.5, 0.5)), (0.1, 0.1), 2, name)
         assert (channel.start(normals) == number).all()
 
 
