@@ -57,7 +57,7 @@ mutants-sample: $(STAMP)  ## the share of killed mutants in 18 modules, 300 draw
 test-lowest: $(LOWEST)/.installed  ## quick tests with the lowest versions that pyproject.toml allows
 	$(LOWEST)/bin/python -m pytest -m "not slow" -n 2 $(QUICK)
 
-wheel-test: $(STAMP)  ## the package outside the repository, and every block of README and docs with it
+wheel-test: $(STAMP)  ## the package outside the repository, and every command of README and docs with it
 	OMP_NUM_THREADS=1 PYTHONPATH=tests/helpers $(BIN)/python tests/repository/wheel_smoke.py
 
 wheel: $(STAMP)  ## build the wheel into dist/
@@ -145,7 +145,7 @@ pages: $(STAMP)  ## tables and the picture of networks in docs/, from the code
 docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links and length of its prose checked
 	$(BIN)/python -m docs.tables --check
 	$(BIN)/python tests/repository/prose.py
-	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -c docs -d runs/docs/doctrees . site/html
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -j 2 -c docs -d runs/docs/doctrees . site/html
 	echo '<meta http-equiv="refresh" content="0; url=html/docs/index.html">' > site/index.html
 
 bench: $(STAMP)  ## steps per second beside the alternatives, as ratios of one run

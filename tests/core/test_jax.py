@@ -387,7 +387,7 @@ def test_a_fork_of_a_process_that_has_run_jax_is_refused() -> None:
     with pytest.warns(RuntimeWarning, match="fork"):
         process.start()
     try:
-        lines = [receiver.recv() for _ in range(4) if receiver.poll(20.0)]
+        lines = [receiver.recv() for _ in range(4) if receiver.poll(6.0)]
     finally:
         process.kill()
     assert len(lines) == 4

@@ -4,16 +4,15 @@ A block is Python, shell or YAML by its fence. An HTML comment before it names e
 
     <!-- needs: agents, render -->
 
-where they cannot be told from its imports and commands. Blocks of one ``session`` go on with each
+where it needs others than the commands do. Blocks of one ``session`` go on with each
 other's names, as a reader of the page does; lines marked ``markdown-exec: hide`` are not printed.
 A first line ``# plant.yaml`` names the file that a block is.
 """
 
-import ast
 import re
 import shlex
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -53,28 +52,10 @@ class Block:
         read = [(line, shlex.split(line, comments=True)) for line in lines]
         return [(line, words) for line, words in read if words]
 
-    def needs(self, extra_of: Callable[[str], str | None]) -> frozenset[str]:
-        """The extras: those named, or those of its imports and commands.
-
-        ``extra_of`` a module is what installs it: an extra, "" for the wheel alone; a module that
-        none installs stands for itself.
-        """
-        if self.named:
-            return self.named
-        if self.language == "python":
-            result = {name: extra_of(name) for name in imported(self.text)}
-            extras = (name if extra is None else extra for name, extra in result.items())
-            return frozenset(filter(None, extras))
-        return frozenset({"agents"} if self.language == "shell" else ())
-
-
-def imported(code: str) -> Iterator[str]:
-    """The modules that a program imports, as they are written there."""
-    for node in ast.walk(ast.parse(code)):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
+    @property
+    def needs(self) -> frozenset[str]:
+        """The extras of a shell block: those named, or that of the commands."""
+        return self.named or frozenset({"agents"})
 
 
 def blocks_of(page: Path, text: str) -> list[Block]:

@@ -1,4 +1,4 @@
-"""Run the blocks of README and the commands of docs, with the wheel and the extras they name.
+"""Run the commands of README and docs, with the wheel and the extras they name.
 
     python tests/repository/wheel_blocks.py [PAGE …] [--wheel FILE]
 
@@ -158,21 +158,16 @@ class Pages:
             (folder / block.file).write_text(block.text)
         if block.language == "yaml":
             return _wrong_yaml(block, later)
-        if block.language == "python" and block.page.parts[0] == "docs":
+        if block.language == "python":
             return None  # `make docs` runs it
-        extras = block.needs(self.wheel.extra_of)
         try:
-            unknown = extras - set(self.wheel.extras)
+            unknown = block.needs - set(self.wheel.extras)
             if unknown:
                 raise Absent(", ".join(unknown))
-            environment = self.wheel.environment(extras)
+            environment = self.wheel.environment(block.needs)
         except Absent as absent:
             self.left.append(f"{block.place} (needs {absent})")
             return None
-        if block.language == "python":
-            script = folder / (block.file or f"block_{block.line}.py")
-            script.write_text(block.text)
-            return _wrong([str(environment.programs / "python"), script.name], environment, folder)
         return self._wrong_shell(block, environment, folder)
 
     def _wrong_shell(self, block: Block, environment: Environment, folder: Path) -> str | None:

@@ -23,8 +23,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 OWN = "fusion-gym"
-# Packages that need the extra "agents".
-OF_AGENTS = ("fusion_gym.commands", "fusion_gym.output", "fusion_gym.training")
 _ALONE = threading.Lock()
 _SCRIPT = """#!{python}
 import sys
@@ -52,13 +50,6 @@ class Environment:
     def packages(self) -> Path:
         """Where its packages are."""
         return Path(sysconfig.get_path("purelib", "venv", vars={"base": str(self.folder)}))
-
-    def has(self, module: str) -> bool:
-        """Whether this module, or its package, can be imported."""
-        if module.partition(".")[0] in sys.stdlib_module_names:
-            return True
-        place = self.packages / module.replace(".", "/")
-        return place.is_dir() or any(place.parent.glob(f"{place.name}.*"))
 
 
 @dataclass(frozen=True)
@@ -105,19 +96,6 @@ class Wheel:
         for item in (own, *needed.values()):
             _scripts(item, environment)
         return environment
-
-    def extra_of(self, module: str) -> str | None:
-        """The extra that installs a module: empty for the wheel alone, none if no extra does."""
-        for extra in ("", "agents", *self.extras):
-            if extra == "test" or (module.startswith(OF_AGENTS) and not extra):
-                continue
-            try:
-                result = self.environment(frozenset(filter(None, [extra])))
-            except Absent:
-                continue
-            if result.has(module):
-                return extra
-        return None
 
 
 def closure(expected: Iterable[Requirement], extras: Iterable[str]) -> dict[str, Distribution]:
