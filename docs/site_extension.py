@@ -93,4 +93,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("doctree-read", lead_to_names, priority=400)  # before files to download are copied
     app.connect("doctree-resolved", fold)
     app.connect("autodoc-process-docstring", write_formulas)
+    app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True  # it names a file alone
     return {"parallel_read_safe": True, "parallel_write_safe": True}

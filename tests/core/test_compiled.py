@@ -222,6 +222,23 @@ def test_code_that_is_not_used_for_thirty_days_is_removed(cache: Path) -> None:
     assert sorted(cache.iterdir()) == others
 
 
+@pytest.mark.slow
+def test_processes_compile_one_step_at_once(tmp_path: Path) -> None:
+    lines = (
+        "import fusion_gym, numpy as np",
+        "from fusion_gym.core.batch import EpisodeBatch",
+        f"task = fusion_gym.make_task('{LINEAR}', backend='compiled')",
+        "print(EpisodeBatch.seeded(task, 2, 0).step(np.ones((2, 2), bool)).reward)",
+    )
+    command = [sys.executable, "-W", "error", "-c", "; ".join(lines)]
+    home = os.environ | {"HOME": str(tmp_path), "PYTHONPATH": os.getcwd()}
+    every = [subprocess.Popen(command, env=home, stdout=subprocess.PIPE) for _ in range(3)]
+    outputs = {process.communicate()[0] for process in every}
+    assert [process.returncode for process in every] == [0, 0, 0]
+    assert len(outputs) == 1
+    assert len([*(tmp_path / ".cache/fusion-gym/compiled").iterdir()]) == 4
+
+
 def test_threads_make_and_step_one_environment(cache: Path) -> None:
     task = fusion_gym.make_task(LINEAR, backend="compiled")
     expected = rewards(task)
