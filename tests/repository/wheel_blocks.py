@@ -47,7 +47,7 @@ LISTED = (
     Listed("make ", "works in a clone: its targets are looked for in the Makefile"),
     Listed("python -m agents.", "works in a clone"),
     Listed("pip install ", "downloads: its extras are looked for in the wheel"),
-    Listed("fusion-gym train --config tobit_oscillator_front", "minutes; wheel_smoke.py trains it"),
+    Listed("fusion-gym train --config tobit_oscillator_front", "minutes"),
     Listed("fusion-gym train ", "minutes", "--timesteps 1024"),
     Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
