@@ -81,10 +81,16 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
         assert bool(result.ended[0])
 
 
+# Without optimization XLA's program of these steps has NaN.
+UNDER_JAX = [task for task in (*TASKS, *MORE_TASKS) if task != ("UnknownInput-v1", {})]
+optimized = pytest.mark.skipif("level=0" in os.environ["XLA_FLAGS"], reason="run by a test below")
+
+
 @pytest.mark.parametrize(
     ("backend", "name", "options"),
     [
-        *slowly((("jax", *task) for task in (*TASKS, *MORE_TASKS)), "RemoteEstimation-v1"),
+        *slowly((("jax", *task) for task in UNDER_JAX), "RemoteEstimation-v1"),
+        pytest.param("jax", "UnknownInput-v1", {}, marks=[pytest.mark.slow, optimized]),
         *slowly([("jax", "TobitOscillator-v1", {"memory": True})]),
         *slowly((("compiled", *task) for task in TASKS[:-3]), "compiled"),
         *slowly(("compiled", *task) for task in (*TASKS[-3:], *MORE_TASKS)),
@@ -334,7 +340,8 @@ def test_functional_environments_are_copied() -> None:
 @pytest.mark.slow
 def test_programs_at_the_default_level_of_xla_equal_numpy() -> None:
     """The other tests compile without XLA's optimization."""
-    words = [sys.executable, "-m", "pytest", "-q", __file__, "-k", "equal_numpy and LinearFusion"]
+    chosen = "equal_numpy and LinearFusion or jax-UnknownInput"
+    words = [sys.executable, "-m", "pytest", "-q", __file__, "-k", chosen]
     subprocess.run(words, env=os.environ | {"XLA_FLAGS": ""}, check=True)
 
 

@@ -108,6 +108,7 @@ POSITIONAL = {("papers", "papers"), ("export", "model"), ("list", "kinds"), ("in
               ("fit", "log"), ("field", "log")}  # fmt: skip
 # Numbers among the hostile ones that an option may have after all.
 ALLOWED = {("seed", "0"), ("seeds", "0"), ("seed", "9" * 30)}
+ALLOWED |= {("error_code", number) for number in ("-1", "0", "2")}
 
 
 class Try(NamedTuple):
