@@ -166,7 +166,11 @@ def flaw(env_id: str, settings: Options, seed: int = 0) -> str | None:
     """
     with _time_limit(), warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", "token_capacity = .* cannot all transmit in one step")
+        for deliberate in (
+            "token_capacity = .* cannot all transmit",
+            "token_rate = .* favour some",
+        ):
+            warnings.filterwarnings("ignore", deliberate)
         try:
             env: VectorEnv[Any, Any, Any] = gymnasium.make_vec(
                 env_id, RUNS, vectorization_mode="vector_entry_point", **settings
