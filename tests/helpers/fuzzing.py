@@ -158,6 +158,13 @@ def options(env_id: str) -> st.SearchStrategy[Options]:
     )
 
 
+DELIBERATE = (
+    "token_capacity = .* cannot all transmit",
+    "token_rate = .* favour some",
+    "backend='compiled' runs under NumPy",
+)
+
+
 def flaw(env_id: str, settings: Options, seed: int = 0) -> str | None:
     """What is wrong with how an environment takes these options; ``None`` for nothing.
 
