@@ -173,10 +173,7 @@ def flaw(env_id: str, settings: Options, seed: int = 0) -> str | None:
     """
     with _time_limit(), warnings.catch_warnings():
         warnings.simplefilter("error")
-        for deliberate in (
-            "token_capacity = .* cannot all transmit",
-            "token_rate = .* favour some",
-        ):
+        for deliberate in DELIBERATE:
             warnings.filterwarnings("ignore", deliberate)
         try:
             env: VectorEnv[Any, Any, Any] = gymnasium.make_vec(
