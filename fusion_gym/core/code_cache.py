@@ -25,7 +25,7 @@ def folder_of(kind: str) -> Path | None:
         return None
     with contextlib.suppress(OSError):
         for file in folder.iterdir():
-            if time.time() - file.stat().st_mtime > _SECONDS:
+            if time.time() - max(file.stat().st_atime, file.stat().st_mtime) > _SECONDS:
                 file.unlink()
     return folder
 

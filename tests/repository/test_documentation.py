@@ -159,4 +159,4 @@ def test_the_bibliography_has_every_paper_that_an_environment_names() -> None:
 def test_the_workflow_runs_the_targets_of_ci() -> None:
     workflow = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text())
     targets = workflow["jobs"]["targets"]["strategy"]["matrix"]["target"]
-    assert re.findall(r"^part (\S+)", (ROOT / ".ci/run").read_text(), re.MULTILINE) == targets
+    assert re.findall(r"^timed make (\S+)", (ROOT / ".ci/run").read_text(), re.MULTILINE) == targets
