@@ -45,7 +45,7 @@ class EpisodeBatch(Runs):
     """
 
     reference_error: Array
-    lost: NDArray[np.bool_] | None = None  # runs (N,) that diverged, which begin anew; None raises
+    nonfinite: NDArray[np.bool_] | None = None  # diverged runs (N,), begun anew; None raises
 
     def __init__(
         self,
@@ -186,11 +186,14 @@ class EpisodeBatch(Runs):
         else:
             outcome = self.deliver(requests) if run is None else self.deliver(requests).single(run)
         diverged = np.count_nonzero(outcome.diverged) if run is None else outcome.diverged
+        broken = None
         if diverged and not np.isfinite(outcome.error).all():
             estimate = self.delivered.estimate
             covariance = self.task.estimator.covariance(estimate)
             mean = self.task.estimator.mean(estimate)
-            self._lose({"covariance": covariance, "mean": mean, "truth": outcome.error})
+            broken = self._check_finite(
+                {"covariance": covariance, "mean": mean, "truth": outcome.error}
+            )
         if self.reference is not None:
             self._refer(self.reference)
         if self._program is None:
@@ -201,17 +204,19 @@ class EpisodeBatch(Runs):
             measurement = self.task.plant.measurement(self.state.plant)
             self._full_state = self.reference.observe(predicted, measurement)
         self.finished = np.array(outcome.ended, ndmin=1)
-        if self.lost is not None and not np.isfinite(outcome.error[..., self.lost]).all():
-            self.reset(np.flatnonzero(self.lost & ~self.finished))
+        if broken is not None:
+            self.reset(np.flatnonzero(broken & ~self.finished))
         return outcome
 
-    def _lose(self, values: Mapping[str, Array]) -> None:
-        """Note the unfinished runs with a value (…, N) that is not finite, or raise an error."""
-        if self.lost is None:
+    def _check_finite(self, values: Mapping[str, Array]) -> NDArray[np.bool_] | None:
+        """Note and return the runs (N,) with a value (…, N) that is not finite, or raise."""
+        if self.nonfinite is None:
             require_finite(values, self.finished, self.steps)
-            return
-        for value in values.values():
-            self.lost |= ~np.isfinite(value).reshape(-1, self.num_envs).all(0) & ~self.finished
+            return None
+        finite = [np.isfinite(value).reshape(-1, self.num_envs).all(0) for value in values.values()]
+        broken = ~np.all(finite, axis=0)
+        self.nonfinite |= broken & ~self.finished
+        return broken
 
     def observe(self, local: bool = False) -> NDArray[np.float32]:
         """Return observations (N, entries); NaN in an unfinished run is a ``DivergenceError``."""
@@ -222,8 +227,8 @@ class EpisodeBatch(Runs):
         if not math.isfinite(np.vdot(observation, observation)):
             entry = np.isnan(observation).argmax(1)  # first NaN of each run
             values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}
-            self._lose(values)
-            observation = observation if self.lost is None else np.nan_to_num(observation)
+            self._check_finite(values)
+            observation = observation if self.nonfinite is None else np.nan_to_num(observation)
         return observation
 
     def normals(self) -> Array:

@@ -13,10 +13,12 @@ import io
 import pickle
 import threading
 import warnings
+from collections import deque
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +35,8 @@ require("backend='compiled'", "compiled", "llvmlite")
 import llvmlite.binding as llvm  # noqa: E402
 
 _PACKAGE = Path(__file__).parent.parent
-_LOADED: dict[str, tuple[Any, int]] = {}  # engines and addresses
+_LOADED: WeakValueDictionary[str, Any] = WeakValueDictionary()  # engines in use
+_RECENT: deque[Any] = deque(maxlen=64)  # engines that may be used again
 _LOCK = threading.RLock()  # of the threads that compile
 
 
@@ -157,20 +160,21 @@ def compile_function(
 
     pointers = [ctypes.c_void_p] * (len(sources) + len(sinks))
     with _LOCK:
-        engine, address = _machine_code(key, source)
+        engine = _machine_code(key, source)
+    address = engine.get_function_address("step")
     result: Any = ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(address)
     result.engine = engine  # whose code LLVM frees with it
     return result
 
 
-def _machine_code(task: Any, source: Callable[[], str]) -> tuple[Any, int]:
-    """Return engine and address of code from this process, the cache, or compiled of its assembly.
+def _machine_code(task: Any, source: Callable[[], str]) -> Any:
+    """Return the engine of code from this process, the cache, or compiled of its assembly.
 
     The cache has the code of a task, and the code of an assembly, which other sources may share.
     """
     name = _fingerprint(task)
-    if name in _LOADED:
-        return _LOADED[name]
+    if engine := _LOADED.get(name or ""):
+        return engine
     code = name and code_cache.read_code(_folder(), name)
     if not code:
         text = source()
@@ -181,10 +185,10 @@ def _machine_code(task: Any, source: Callable[[], str]) -> tuple[Any, int]:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(jit=True))
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    result = engine, engine.get_function_address("step")
     if name:
-        _LOADED[name] = result
-    return result
+        _LOADED[name] = engine
+        _RECENT.append(engine)
+    return engine
 
 
 @functools.cache

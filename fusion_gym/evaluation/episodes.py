@@ -227,12 +227,13 @@ def _results(
     means = {name: np.zeros(runs) for name in _MEANS}
     rate, requests = np.zeros((sensors, runs)), np.zeros((sensors, runs))
     returns, squared_error = np.zeros(runs), []
-    batch.lost = lost = np.zeros(runs, dtype=np.bool_)
+    batch.nonfinite = lost = np.zeros(runs, dtype=np.bool_)
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
         covariance = task.estimator.covariance(batch.delivered.estimate)
         errors = np.where(lost, 0.0, outcome.squared_error).reshape(-1, parts, episodes).sum(-1)
-        squared_error.append(errors / (~lost).reshape(parts, episodes).sum(-1))
+        finite = (~lost).reshape(parts, episodes).sum(-1)
+        squared_error.append(np.where(finite > 0, errors / np.maximum(finite, 1), np.nan))
         for name, mean in _MEANS.items():
             means[name] += mean(_Step(batch, outcome, covariance))
         rate += outcome.granted

@@ -2,15 +2,18 @@
 
 import ctypes
 import dataclasses
+import gc
 import hashlib
 import os
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import gymnasium
 import jax
@@ -156,7 +159,7 @@ def test_an_unknown_primitive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty cache, without what this process has loaded."""
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    monkeypatch.setattr(compiled, "_LOADED", {})
+    monkeypatch.setattr(compiled, "_LOADED", WeakValueDictionary())
     compiled._folder.cache_clear()
     yield tmp_path / ".cache/fusion-gym/compiled"
     compiled._folder.cache_clear()
@@ -375,3 +378,11 @@ def test_figures_of_policies_are_those_of_numpy(name: str, options: dict[str, An
         for field in dataclasses.fields(numpy):
             pair = (getattr(part, field.name) for part in (ours, numpy))
             np.testing.assert_allclose(*pair, rtol=1e-9, atol=1e-12, err_msg=field.name)
+
+
+def test_code_that_no_task_uses_is_freed(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "_RECENT", deque(maxlen=2))
+    for value in (1.0, 2.0, 3.0):
+        rewards(fusion_gym.make_task(LINEAR, backend="compiled", measurement_covariances=value))
+    gc.collect()
+    assert len(compiled._LOADED) == 2  # the start and the step of the last one

@@ -308,4 +308,5 @@ def test_runs_that_diverge_leave_the_others(monkeypatch: pytest.MonkeyPatch) -> 
     assert summary["mse"]["mean"] == pytest.approx(whole.mse[~lost].mean())
     with np.errstate(invalid="ignore"):
         alone = evaluate(task, "always", 1, 10 + int(lost.argmax()))
+    assert np.isnan(alone.squared_error[-1]).all()
     refused(lambda: summarise(alone), "all 1 episodes diverged", kind=DivergenceError)

@@ -1,6 +1,6 @@
 """Kill a command at random moments, go on with it, and compare with an undisturbed run.
 
-    python tests/helpers/kills.py {train} [--kills 15] [--seed 0]
+    python tests/helpers/kills.py {train,search,calibrate} [--kills 15] [--seed 0]
 
 Every attempt is a fork of this process, which has imported everything: kills fall into the
 command's own work. The end must be that of the undisturbed run, bit by bit.
@@ -20,7 +20,10 @@ from small_runs import arguments, meaning
 
 from fusion_gym.commands.__main__ import load
 
-SIZES = {"train": 16_384}  # steps of a training
+SIZES = {"train": 16_384, "search": 1_024, "calibrate": 0}  # steps of a training
+
+# The first file of each command that resumes.
+FIRST = {"train": "run/config.yaml", "search": "search/generations.json", "calibrate": ""}
 
 
 def attempt(command: str, words: list[str], log: Path, seconds: float | None) -> str:
@@ -56,7 +59,7 @@ def attempt(command: str, words: list[str], log: Path, seconds: float | None) ->
 
 def begun(command: str, folder: Path) -> bool:
     """Whether the command needs --resume to go on."""
-    return command == "train" and (folder / "run" / "config.yaml").exists()
+    return (folder / FIRST[command]).is_file()
 
 
 def main() -> None:

@@ -17,6 +17,14 @@ def arguments(command: str, folder: Path, seed: int = 0, steps: int = 256) -> li
     if command == "evaluate":
         options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]
         return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
+    if command in ("search", "calibrate"):
+        options = ["token_rate=2", "memory=true", "random_start=true", "filter=tobit"]
+        words = ["--env", ENV, "--set", *options, f"horizon={20 + seed}", "--prices", "2"]
+        if command == "search":
+            return [*words, "--generations", str(1 + steps // 256), "--output", f"{folder}/search"]
+        priced = ["--set", "cost_weight=random", "price_range=[0.01513,2.353]"]
+        agent = [*priced, "--policy", "zoo:tobit_oscillator_scheduler", "--episodes", "2"]
+        return [*words, *agent, "--output", f"{folder}/calibrated.zip"]
     training = {"timesteps": steps, "num_envs": 8, "seed": seed}
     every = {"every": min(1024, steps // 2), "episodes": 2}
     words = ["--config", str(small_config(folder, training=training, validation=every))]
@@ -39,6 +47,9 @@ def _content(path: Path, folder: str) -> Any:
             with zipfile.ZipFile(path) as archive:
                 weights = torch.load(io.BytesIO(archive.read("policy.pth")))
             return {name: weight.tolist() for name, weight in weights.items()}
+        case "calibrated.zip", _:
+            with zipfile.ZipFile(path) as archive:
+                return archive.read("calibration.json").decode()
         case _, ".csv":
             return path.read_text()
         case _, ".json" | ".jsonl":

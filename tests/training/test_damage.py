@@ -22,7 +22,11 @@ DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
     ),
 }
 # The files without which a command cannot go on.
-READ: dict[str, tuple[str, ...]] = {"train": ("run/latest.zip",), "evaluate": ("result.json",)}
+READ: dict[str, tuple[str, ...]] = {
+    "train": ("run/latest.zip",),
+    "evaluate": ("result.json",),
+    "search": ("search/generations.json",),
+}
 # Those that it writes anew.
 WRITTEN = {
     "train": (
@@ -30,6 +34,7 @@ WRITTEN = {
         *("run/validation.jsonl", "run/summary.json"),
     ),
     "evaluate": (),
+    "search": ("search/search.json",),
 }
 
 

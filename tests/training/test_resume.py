@@ -100,12 +100,13 @@ def test_a_resumed_training_is_the_uninterrupted_one(
 
 
 @pytest.mark.slow
-def test_kills_at_random_moments_lose_nothing() -> None:
-    line = [sys.executable, "tests/helpers/kills.py", "train", "--kills", "3"]
+@pytest.mark.parametrize("command", ["train", "search", "calibrate"])
+def test_kills_at_random_moments_lose_nothing(command: str) -> None:
+    line = [sys.executable, "tests/helpers/kills.py", command, "--kills", "3"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "train: 3 kills" in done.stdout
+    assert f"{command}: 3 kills" in done.stdout
 
 
 def test_threads_timesteps_and_output_may_change_and_nothing_else(tmp_path: Path) -> None:

@@ -289,12 +289,15 @@ def _intersample(options: Any, weights: Array) -> Any:
     return _IntersampleCost(np.array(steps), weights)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class _IntersampleCost:
     """Mean weighted square of the small steps' errors, from those (n, N) of state and input."""
 
     steps: Array
     weights: Array
+
+    def __repr__(self) -> str:
+        return "intersample_error"
 
     def __call__(self, error: Array, covariance: Array) -> Array:
         states = np.square((self.steps[..., None] * error).sum(2)).mean(0)
