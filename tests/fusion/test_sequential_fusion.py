@@ -59,6 +59,15 @@ def test_it_is_the_two_sensor_rule_again_and_again(rule: str, order: Any) -> Non
         np.testing.assert_allclose(result.covariance[..., lane], expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("rule", RULES)
+def test_nobody_active_leaves_the_prediction(rule: str) -> None:
+    mean, covariance = estimates(5)
+    result = fuse(rule, None, mean, covariance, np.zeros((3, 5), dtype=np.bool_))
+    np.testing.assert_array_equal(result.mean, mean[0])
+    np.testing.assert_array_equal(result.covariance, covariance[0])
+    assert result.gains.shape == (4, 3, 3, 5)
+
+
 @pytest.mark.parametrize("order", [(), (0, 0, 1), (1, 2, 3), (-1, 0, 1), (True, False), 7, [0, 1]])
 def test_an_order_that_is_no_permutation_is_refused(order: Any) -> None:
     with pytest.raises(ConfigurationError, match=r"^order = .* is not allowed"):

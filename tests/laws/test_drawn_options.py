@@ -11,7 +11,7 @@ from cases import SCARCE, VARIANTS, Options
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 
-RUNS, STEPS, SETS = 3, 300, 60
+RUNS, STEPS, SETS = 3, 300, 2
 VALUES: dict[str, tuple[Any, ...]] = {
     "access": ("any", "single", "round_robin", "random"),
     "acknowledgements": ("none", 0.5),

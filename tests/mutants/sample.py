@@ -1,6 +1,6 @@
 """Draw mutants of modules by a seed, and count those that tests kill (``make mutants-sample``).
 
-    python tests/mutants/sample.py --output mutants.json [--seed 0] [--count 300] [--resume]
+    python tests/mutants/sample.py --output mutants.json [--seed 0] [--count 9] [--resume] [FILE …]
 
 The changes are those of mutmut; ``selection.json`` has the tests of each module.
 """
@@ -55,8 +55,10 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=300, help="mutants of all modules together")
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--resume", action="store_true", help="skip mutants in the output")
+    parser.add_argument("modules", nargs="*", help="by default all of selection.json")
     args = parser.parse_args()
     selection = json.loads(SELECTION.read_text())
+    selection = {name: selection[name] for name in args.modules or selection}
     resumed = args.resume and args.output.exists()
     results = json.loads(args.output.read_text()) if resumed else {}
     whole = [((name, ""), name, Path(name).read_text(), tests) for name, tests in selection.items()]

@@ -93,6 +93,14 @@ def test_a_price_is_a_threshold_in_the_rewards_units(own: bool) -> None:
         np.testing.assert_array_equal(requests[sensor], other[sensor])
 
 
+def test_without_a_price_the_threshold_is_that_of_its_page() -> None:
+    signals = later(task_of(memory=True)).signals()
+    names = "value_of_information", "value_of_information:threshold=0.03"
+    requests, same = (fusion_gym.make_policy(name, task_of(memory=True))(signals) for name in names)
+    np.testing.assert_array_equal(requests, same)
+    share(requests)
+
+
 def test_at_most_takes_the_most_valuable_and_ties_go_to_the_longest_silent() -> None:
     task = task_of(memory=True)
     signals = later(task, runs=200).signals()

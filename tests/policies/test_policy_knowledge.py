@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from what_matters import (
     ANYTHING,
     CHARACTERISTIC,
@@ -24,7 +25,7 @@ from what_matters import (
 import fusion_gym
 from agents.papers.walk import walk
 from fusion_gym import zoo
-from fusion_gym.core.knowledge import Knowledge, Signals
+from fusion_gym.core.knowledge import Knowledge, Signal, Signals
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import read
@@ -285,3 +286,9 @@ def test_a_policy_that_lies_is_caught(name: str) -> None:
         assert f"{REFUSED[name]!r} belongs to the class" in str(caught.value)
     else:
         assert what in what_matters(make_policy(name, task), task)
+
+
+@pytest.mark.parametrize(("field", "value"), [("knowledge", "nobody"), ("node", "all")])
+def test_a_signal_belongs_to_a_class(field: str, value: str) -> None:
+    fields: dict[str, Any] = {"name": "a", "knowledge": "own", "axes": "(N,)", "meaning": "a"}
+    refused(lambda: Signal(**fields | {field: value}), f"{field} = {value!r} is not allowed")

@@ -229,3 +229,11 @@ def test_the_index_is_compared_with_the_price_of_each_sensors_packet() -> None:
             np.testing.assert_array_equal(requests[sensor], other(signals)[sensor])
         batch.step(np.arange(3)[:, None] == (step + np.arange(30)) % 3)
     assert 0.0 < requests.mean() < 1.0
+
+
+def test_the_optimum_of_one_request_is_that_of_one_slot() -> None:
+    two = make(2, access="any", tokens="unlimited", cost_weight=0.01)
+    limited, free = (AgeOptimum(two, at_most=most, longest=12) for most in (1, None))
+    one = AgeOptimum(make(2, cost_weight=0.01), longest=12)
+    np.testing.assert_array_equal(limited.solution.choice, one.solution.choice)
+    assert free.solution.cost < limited.solution.cost
