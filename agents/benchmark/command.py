@@ -4,7 +4,7 @@
     python -m agents.benchmark --suite channels
     python -m agents.benchmark --policy 'value_of_information:price={price}' --class scheduler
 
-In every class it freezes five prices, tunes the rules of the literature, searches one rule for all
+At five prices of every class it tunes the rules of the literature, searches one rule for all
 prices, trains agents, and compares all of them on the same test episodes. Into the results folder
 go the tables, a figure a setting and ``README.md``. With ``--policy`` your own policy is compared
 with the searched rule of a class; ``{price}`` in its text stands for the price.

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.benchmark import verdict
+from agents.benchmark.calibration import CalibrationJob, CalibrationResult, run_calibration
 from agents.benchmark.jobs import Runner
 from agents.benchmark.rules import SearchJob, SweepJob, SweepResult, rules_of, run_search, run_sweep
 from agents.benchmark.settings import Case, ClassName, Setting, Suite, knowledge_of
-from agents.benchmark.training import TrainingJob, TrainingResult, run_training
+from agents.benchmark.training import TrainingJob, run_training
 from agents.benchmark.verdict import mean_difference
 from fusion_gym.core.knowledge import covers
 from fusion_gym.policies.registry import make_policy
@@ -107,6 +108,18 @@ class CaseRow(NamedTuple):
     high: float
 
 
+class Trained(NamedTuple):
+    """A training, its processor seconds, its calibration, and the file of the calibrated policy.
+
+    Where agents cannot be calibrated the policy is the agent.
+    """
+
+    job: TrainingJob
+    seconds: float
+    calibration: CalibrationResult
+    policy: Path
+
+
 @dataclass
 class Evidence:
     """The results of a class of a setting, by kind of policy and training seed."""
@@ -115,7 +128,7 @@ class Evidence:
     name: ClassName
     sweep: SweepResult
     rule: str = ""
-    trainings: dict[str, list[tuple[TrainingJob, TrainingResult]]] = field(default_factory=dict)
+    trainings: dict[str, list[Trained]] = field(default_factory=dict)
     tests: dict[str, list[TestResults]] = field(default_factory=dict)
     bounds: tuple[float, ...] = ()
     cases: dict[str, tuple[TestResults, TestResults]] = field(default_factory=dict)
@@ -123,7 +136,7 @@ class Evidence:
     @property
     def prices(self) -> tuple[float, ...]:
         """Prices of the class, in increasing order."""
-        return self.sweep.prices
+        return tuple(self.setting.prices[self.name])
 
     def test(
         self, policies: Sequence[str], episodes: int, case: Case | None = None,
@@ -138,8 +151,7 @@ class Evidence:
         agent = texts[0].startswith("model:")
         content = "\n".join(texts)
         if agent:
-            file = Path(texts[0].removeprefix("model:").rpartition(",price=")[0])
-            content = hashlib.sha256(file.read_bytes()).hexdigest()
+            content = hash_of(Path(texts[0].removeprefix("model:").rpartition(",price=")[0]))
         return verdict.TestJob(
             self.setting, self.name, texts, own_prices, self.prices, episodes, content, agent, case
         )
@@ -152,18 +164,23 @@ class Evidence:
     @property
     def best_seed(self) -> int:
         """Seed of the training whose calibrated policy costs least on its tuning episodes."""
-        costs = [result.relative_cost for _, result in self.trainings["agent"]]
+        costs = [item.calibration.relative_cost for item in self.trainings["agent"]]
         return int(np.argmin(costs))
 
     @property
     def best_policy(self) -> Path:
         """File of the calibrated policy with that seed."""
-        return self.trainings["agent"][self.best_seed][0].policy
+        return self.trainings["agent"][self.best_seed].policy
+
+
+def hash_of(file: Path) -> str:
+    """Return the hash of a file's content."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     """Run unfinished work, and return all classes."""
-    classes = find_prices(suite, runner)
+    classes = tune_thresholds(suite, runner)
     find_rules(suite, runner, classes)
     train_agents(suite, runner, classes)
     jobs = [verdict.BoundJob(item.setting, item.name, item.prices) for item in classes]
@@ -175,11 +192,16 @@ def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     return classes
 
 
-def find_prices(suite: Suite, runner: Runner, only: ClassName | None = None) -> list[Evidence]:
-    """Tune the rules with one threshold, and freeze the prices of the classes or of one."""
+def tune_thresholds(suite: Suite, runner: Runner, only: ClassName | None = None) -> list[Evidence]:
+    """Tune the rules with one threshold at the prices of the classes, or of one."""
     places = [(s, name) for s in suite.settings for name in ([only] if only else s.classes)]
     jobs = [
-        SweepJob(*place, rules_of(*place, suite.rules), suite.shares, suite.tuning_episodes)
+        SweepJob(
+            *place,
+            rules_of(*place, suite.rules),
+            tuple(place[0].prices[place[1]]),
+            suite.tuning_episodes,
+        )
         for place in places
     ]
     results = runner.run(run_sweep, jobs, "single thresholds")
@@ -205,14 +227,27 @@ def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> N
             for seed in range(suite.seeds(*own)):
                 folder = f"{item.setting.name}_{item.name}_{algorithm.name}_{seed}"
                 experiment = suite.experiment(*own, item.prices, seed, algorithm, steps)
-                job = TrainingJob(
-                    *own, experiment, item.prices, item.rule, suite.calibration_episodes,
-                    runner.folder / "agents" / folder,
-                )  # fmt: skip
+                weight = float(item.setting.seconds[item.name])
+                job = TrainingJob(experiment, runner.folder / "agents" / folder, weight)
                 places.append((item, kind, job))
-    results = runner.run(run_training, [job for _, _, job in places], "trainings")
-    for (item, kind, job), result in zip(places, results, strict=True):
-        item.trainings.setdefault(kind, []).append((job, result))
+    spent = runner.run(run_training, [job for _, _, job in places], "trainings")
+    calibrations = [
+        CalibrationJob(
+            item.setting, item.name, hash_of(job.agent), job.experiment.environment.options,
+            item.prices, item.rule, suite.calibration_episodes, job.agent,
+            job.folder / "calibrated_model.zip",
+        )
+        for item, _, job in places if item.setting.calibrated
+    ]  # fmt: skip
+    every = zip(
+        calibrations, runner.run(run_calibration, calibrations, "calibrations"), strict=True
+    )
+    for (item, kind, job), seconds in zip(places, spent, strict=True):
+        policy, result = job.agent, CalibrationResult(0.0, math.nan, ())
+        if item.setting.calibrated:
+            calibration, result = next(every)
+            policy = calibration.policy
+        item.trainings.setdefault(kind, []).append(Trained(job, seconds, result, policy))
 
 
 def test_all(
@@ -240,9 +275,9 @@ def policies_of(item: Evidence) -> Iterator[tuple[str, list[str]]]:
     if item.setting.optimum is not None and item.name == "scheduler":
         yield "optimum", [item.setting.optimum] * count
     for kind, every in item.trainings.items():
-        for job, _ in every:
-            yield kind, [f"model:{job.agent},price={{price}}"] * count
-            yield CALIBRATED[kind], [f"model:{job.policy},price={{price}}"] * count
+        for trained in every:
+            yield kind, [f"model:{trained.job.agent},price={{price}}"] * count
+            yield CALIBRATED[kind], [f"model:{trained.policy},price={{price}}"] * count
 
 
 def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
@@ -275,7 +310,7 @@ def check_policy(suite: Suite, text: str, name: ClassName) -> None:
 
 def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) -> list[Evidence]:
     """Test a policy in a class of every setting, together with the searched rule."""
-    classes = find_prices(suite, runner, name)
+    classes = tune_thresholds(suite, runner, name)
     find_rules(suite, runner, classes)
     places = [
         (item, kind, [policy] * len(item.prices))
@@ -366,16 +401,16 @@ def training_rows(classes: Sequence[Evidence]) -> list[TrainingRow]:
     for item in classes:
         (reference,) = item.tests[REFERENCE]
         for kind, every in item.trainings.items():
-            for seed, (job, result) in enumerate(every):
+            for seed, (job, seconds, result, _) in enumerate(every):
                 agent, learned = (
                     mean_difference([([item.tests[name][seed]], reference)]).mean
                     for name in (kind, CALIBRATED[kind])
                 )
                 rule_only = sum(point.mixture == 1.0 for point in result.points)
                 algorithm, training = job.experiment.algorithm.name, job.experiment.training
-                seconds = result.seconds, result.calibration_seconds
-                own = algorithm, seed, training.timesteps, *seconds, rule_only, agent, learned
-                rows.append(TrainingRow(item.setting.name, item.name, kind, *own))
+                place = item.setting.name, item.name, kind, algorithm, seed
+                work = training.timesteps, seconds, result.seconds
+                rows.append(TrainingRow(*place, *work, rule_only, agent, learned))
     return rows
 
 

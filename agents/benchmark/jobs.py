@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import pydantic
 
@@ -16,9 +16,23 @@ from fusion_gym.entries import Plain
 from fusion_gym.evaluation.rule_search import ClassName
 from fusion_gym.output.files import fingerprint
 
-AnyJob = TypeVar("AnyJob", bound="Job")
+AnyJob = TypeVar("AnyJob", bound="AnyInputs")
 Result = TypeVar("Result")
 _PLAIN: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(Any)
+
+
+class AnyInputs(Protocol):
+    """What a runner needs of a job."""
+
+    @property
+    def inputs(self) -> Plain:
+        """The key of its result."""
+        ...
+
+    @property
+    def weight(self) -> float:
+        """About its seconds on one core."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
-"""Rules with one threshold, the five prices of a class, and the search of one rule for all."""
+"""Rules with one threshold at each price of a class, and the search of one rule for all."""
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -16,9 +15,7 @@ from agents.benchmark.settings import Case, ClassName, Setting, ThresholdRule, k
 from fusion_gym import seeds
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import covers
-from fusion_gym.core.scale import prices_at
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.rule_search import (
     Generation,
     ThresholdTrial,
@@ -32,7 +29,6 @@ from fusion_gym.validation import ConfigurationError
 
 COUNT = 16  # thresholds of a rule over its whole range
 FINER = 6  # between the neighbours of the best one
-APART = 1.2  # neighbouring prices, at least, as a factor
 NEAR = 1.1  # rules whose cost is so near the least, as a factor, are tuned finer
 
 
@@ -41,7 +37,7 @@ class SweepJob(Job):
     """Every rule of a class over its thresholds, on a finer grid near the best at each price."""
 
     rules: tuple[ThresholdRule, ...]
-    shares: tuple[float, ...]
+    prices: tuple[float, ...]
     episodes: tuple[int, int]
     weight: ClassVar[float] = 25.0
 
@@ -59,9 +55,8 @@ class TunedRule:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """The frozen prices of a class, and every rule's best threshold at each."""
+    """Every rule's best threshold at each price of a class."""
 
-    prices: tuple[float, ...]
     tuned: tuple[TunedRule, ...]
 
     def best(self, price: float, rule: str | None = None) -> TunedRule:
@@ -84,25 +79,22 @@ class SearchJob(Job):
 
 
 def run_sweep(job: SweepJob) -> SweepResult:
-    """Choose the prices of a class, and tune every rule at each on the tuning episodes."""
+    """Tune every rule at each price on the tuning episodes."""
     tasks = {rule: job.setting.task(job.name, rule.case) for rule in job.rules}
     trials = {
         rule: _try(task, rule, np.geomspace(*rule.ends, COUNT), job.episodes[0])
         for rule, task in tasks.items()
     }
-    usual = {rule: own for rule, own in trials.items() if rule.case is None}
-    task = job.setting.task(job.name)
-    prices = _prices(task, list(itertools.chain(*usual.values())), job)
     tuned = []
-    for price in prices:
+    for price in job.prices:
         best = {rule: min(own, key=lambda t: t.cost(price)) for rule, own in trials.items()}
-        least = min(best[rule].cost(price) for rule in usual)
+        least = min(trial.cost(price) for rule, trial in best.items() if rule.case is None)
         for rule, trial in best.items():
             if trial.cost(price) <= NEAR * least or rule == job.setting.trigger:
                 trial = _finer(tasks[rule], job, rule, trials[rule], trial, price)
             cost = trial.cost(price)
             tuned.append(TunedRule(rule.policy, price, trial.policy, cost, rule.case))
-    return SweepResult(prices, tuple(tuned))
+    return SweepResult(tuple(tuned))
 
 
 def rules_of(
@@ -124,17 +116,6 @@ def rules_of(
 
 def _try(task: Task, rule: ThresholdRule, values: Array, episodes: int) -> list[ThresholdTrial]:
     return try_thresholds(task, rule.policy, values.tolist(), episodes, seeds.TUNING.start)
-
-
-def _prices(task: Task, trials: Sequence[ThresholdTrial], job: SweepJob) -> tuple[float, ...]:
-    """Return the prices at which the best of all trials spends the shares of ``always``."""
-    always = make_policy("always", task)
-    most = float(run_episodes(task, always, job.episodes[0], seeds.TUNING.start).tokens.mean())
-    tokens, error = np.array([(trial.tokens, trial.error) for trial in trials]).T
-    prices = prices_at(tokens, error, np.array(job.shares) * most)
-    for place in range(1, len(prices)):
-        prices[place] = max(prices[place], APART * prices[place - 1])
-    return tuple(float(f"{price:.4g}") for price in prices)
 
 
 def _finer(
@@ -163,4 +144,4 @@ def run_search(job: SearchJob) -> str:
         with replacing(state) as partial:
             partial.write_text(json.dumps([asdict(item) for item in generations]))
 
-    return search_rule(search, earlier, store).policy
+    return search_rule(search, earlier, store).policies[0]

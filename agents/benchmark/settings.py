@@ -46,8 +46,9 @@ class ThresholdRule(Strict):
 class Setting(Strict):
     """An environment with options, its own trigger, and the length of its trainings.
 
-    ``named_rules`` are tested by their titles like the trigger. ``optimum`` is a policy with
-    ``{price}``, ``seconds`` about the length of a training in a class.
+    ``named_rules`` are tested by their titles like the trigger. ``prices`` has a list
+    for each class, ``seconds`` about the length of a training in a class. ``optimum`` is a policy
+    with ``{price}``.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -58,6 +59,7 @@ class Setting(Strict):
     trigger_title: str
     named_rules: dict[str, ThresholdRule] = pydantic.Field(default_factory=dict)
     classes: tuple[ClassName, ...] = CLASSES
+    prices: dict[ClassName, list[Rate]]
     agent_options: Options = pydantic.Field(default_factory=dict)
     memory: bool = True
     optimum: str | None = None

@@ -1,75 +1,47 @@
-"""Agents of a class at random prices of its range, each calibrated with the searched rule."""
+"""Agents of the benchmark, each trained at random prices of a range.
+
+This module imports no other part of the benchmark, so that its changes train nothing again.
+"""
 
 from __future__ import annotations
 
 import io
 import json
-import math
-import time
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from agents.benchmark.jobs import Job
 from fusion_gym.entries import Plain
-from fusion_gym.envs.registration import make_task
 from fusion_gym.output.files import replacing
-from fusion_gym.output.progress import quietly
-from fusion_gym.policies.calibrated import CalibrationPoint
-from fusion_gym.training.calibration import EPISODES, calibrate
 from fusion_gym.training.checkpoint import DAMAGED
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import ConfigurationError
 
-CALIBRATION = 0.3  # seconds of a calibration over a training's
-
 
 @dataclass(frozen=True)
-class TrainingJob(Job):
-    """One agent and its calibration; checkpoints and models are in the folder."""
+class TrainingJob:
+    """A training; checkpoints and models are in the folder, ``weight`` is about its seconds."""
 
     experiment: Experiment
-    prices: tuple[float, ...]
-    rule: str
-    episodes: tuple[int, int] = EPISODES
-    folder: Path = field(default=Path(), metadata={"key": False})
+    folder: Path
+    weight: float
 
     @property
-    def weight(self) -> float:  # type: ignore[override]
-        """Return about the seconds on one core, of training and calibration."""
-        return (1.0 + CALIBRATION) * self.setting.seconds[self.name]
+    def inputs(self) -> Plain:
+        """Return the key of the result."""
+        return {"experiment": self.experiment.model_dump(mode="json")}
 
     @property
     def agent(self) -> Path:
         """Return the file of the agent, without its optimiser's state."""
         return self.folder / "agent.zip"
 
-    @property
-    def policy(self) -> Path:
-        """Return the file of the calibrated agent, or of the agent that cannot be calibrated."""
-        return self.folder / "calibrated_model.zip" if self.setting.calibrated else self.agent
 
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """Processor seconds of training and calibration, and the calibration.
-
-    ``relative_cost`` is the mean over the prices of the cost over the rule's, minus 1, in tuning,
-    NaN without a calibration.
-    """
-
-    seconds: float
-    calibration_seconds: float
-    relative_cost: float
-    points: tuple[CalibrationPoint, ...]
-
-
-def run_training(job: TrainingJob) -> TrainingResult:
-    """Train or continue, calibrate, and return the costs of both."""
+def run_training(job: TrainingJob) -> float:
+    """Train or continue, and return the processor seconds."""
     torch.set_num_threads(1)
     experiment = job.experiment.model_copy(update={"output": str(job.folder)})
     summary = train(experiment, resume=holds_training(job.folder), quiet=True)
@@ -77,19 +49,8 @@ def run_training(job: TrainingJob) -> TrainingResult:
         raise KeyboardInterrupt
     with replacing(job.agent) as partial:
         partial.write_bytes(small_model(job.folder / "best_model.zip"))
-    seconds = sum(value for name, value in summary["seconds"].items() if name != "validation")
-    if not job.setting.calibrated:
-        return TrainingResult(seconds, 0.0, math.nan, ())
-    environment, began = experiment.environment, time.process_time()
-    task = make_task(environment.id, **environment.options)
-    with quietly():
-        rows = calibrate(task, [job.agent], job.prices, job.episodes, job.policy, job.rule)
-    return TrainingResult(
-        seconds,
-        time.process_time() - began,
-        float(np.mean([row.cost / row.rule_cost for row in rows])) - 1.0,
-        tuple(row.point for row in rows),
-    )
+    seconds = (value for name, value in summary["seconds"].items() if name != "validation")
+    return float(sum(seconds))
 
 
 OPTIMISER = "policy.optimizer.pth"

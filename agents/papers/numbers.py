@@ -13,7 +13,7 @@ from fusion_gym.evaluation.metrics import LEVEL, Interval, mean_interval
 
 Verdict = Literal[
     "holds",
-    "fails under every admissible reading tried",
+    "fails under the readings tried",
     "depends on what the text leaves open",
     "misprint, or lost in our copy of the text",
     "undecided",

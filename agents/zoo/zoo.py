@@ -61,7 +61,7 @@ class Zoo(Long):
 def agent_card(suite: Suite, item: Evidence, model: bytes) -> Plain:
     """Return the content of an agent's JSON."""
     seed = item.best_seed
-    experiment = item.trainings["agent"][seed][0].experiment
+    experiment = item.trainings["agent"][seed].job.experiment
     options = dict(experiment.environment.options)
     for name in ("cost_weight", "price_range"):
         options.pop(name)

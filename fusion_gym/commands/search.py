@@ -1,15 +1,16 @@
-r"""Search one rule for all prices of a token; an interrupted search can be resumed.
+r"""Search the parameters of a rule; an interrupted search can be resumed.
 
     fusion-gym search --env fusion_gym/LinearFusion-v2 --set system=plant.yaml token_rate=.5 \
         --output runs/search
 
-The rule is ``priced_threshold``, whose threshold depends on the price, the tokens and the age. The
-search over its dozen numbers (CMA-ES) starts from the best single threshold at each price. The
-prices are evenly spaced on a logarithmic scale over the price_range of the environment, by default
-``auto``.
+Without ``--rule`` one ``priced_threshold`` serves all prices: its threshold depends on the price,
+the tokens and the age. The search over its dozen parameters (CMA-ES) starts from the best single
+threshold at each price. With ``--rule`` every price has a search of its own over the parameters
+that the text leaves, with a value for each sensor where the rule allows it. The prices are evenly
+spaced on a logarithmic scale over the price_range of the environment, by default ``auto``.
 
 The command writes ``generations.json`` into the output folder after every generation, and
-``search.json`` at the end. The latter contains the rule as text, its cost at each price on fresh
+``search.json`` at the end. The latter contains the rule at each price as text, its cost on fresh
 episodes, and the cost of the best single threshold there.
 """
 
@@ -26,11 +27,11 @@ from fusion_gym.commands.options import OUTPUT_FOLDER, whole
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options, Plain
 from fusion_gym.envs.registration import make_task
+from fusion_gym.errors import forbidden
 from fusion_gym.evaluation import rule_search
 from fusion_gym.output import tables
 from fusion_gym.output.files import check_inputs, folder_refusal, lock_folder, read_json, write
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.training.checked import checked
 from fusion_gym.validation import ConfigurationError
 
@@ -39,12 +40,14 @@ _GENERATIONS, _RESULT = "generations.json", "search.json"
 
 @dataclass(frozen=True)
 class Search(EnvironmentOptions, Long):
-    """Search one rule for all prices of a token."""
+    """Search the parameters of a rule."""
 
     output: Annotated[Path, OUTPUT_FOLDER]
     """Folder of the search."""
-    class_name: Annotated[rule_search.ClassName, tyro.conf.arg(name="class")] = "scheduler"
-    """Who decides: a scheduler with all measurements, every sensor locally, or the centre."""
+    class_name: Annotated[rule_search.ClassName | None, tyro.conf.arg(name="class")] = None
+    """Who decides: scheduler with all measurements (default), every sensor locally, or centre."""
+    rule: str | None = None
+    """Text of another rule to search; it decides by its own knowledge."""
     prices: Annotated[int, whole(2, 100)] = 5
     """Number of prices of a token, from the lowest to the highest."""
     generations: Annotated[int, whole(1, 10_000)] = 30
@@ -57,18 +60,24 @@ class Search(EnvironmentOptions, Long):
         env_id, options = self.environment()
         task = make_task(env_id, **options)
         prices = token_prices(env_id, options, task, self.prices)
-        search = rule_search.search_of_class(
-            self.class_name, task, prices, generations=self.generations
-        )
-        make_policy(search.text, task)  # refuses before it creates a folder
-        inputs: Plain = {"env": env_id, "class": self.class_name, "prices": search.prices}
-        inputs |= {"generations": self.generations, "settings": search.task.settings}
+        if self.rule is not None and self.class_name is not None:
+            raise forbidden("class", self.class_name, "leave it out", "with --rule")
+        if self.rule is None:
+            search = rule_search.search_of_class(
+                self.class_name or "scheduler", task, prices, generations=self.generations
+            )
+        else:
+            search = rule_search.RuleSearch(task, prices, self.rule, generations=self.generations)
+        chosen = self.class_name or ("scheduler" if self.rule is None else None)
+        inputs: Plain = {"env": env_id, "class": chosen, "rule": self.rule}
+        inputs |= {"prices": search.prices, "generations": self.generations}
+        inputs |= {"settings": search.task.settings}
         self.earlier(inputs)  # refuses before it creates a folder
         with lock_folder(self.output, "output"):
             writing(("the generations and the rule", self.output))
             result = self.continued(search, inputs)
             write(self.output / _RESULT, asdict(result) | {"inputs": inputs})
-        print(result.policy)
+        print("\n".join(dict.fromkeys(result.policies)))
         tables.console().print(result_table(env_id, result))
 
     def continued(self, search: rule_search.RuleSearch, inputs: Plain) -> rule_search.SearchResult:
@@ -82,7 +91,8 @@ class Search(EnvironmentOptions, Long):
             write(self.output / _GENERATIONS, {"inputs": inputs, "generations": plain})
 
         keep()
-        with progress_bar(self.generations, "searching", initial, unit="generations") as bar:
+        count = self.generations * len(search.parts)
+        with progress_bar(count, "searching", initial, unit="generations") as bar:
 
             def progress(generation: rule_search.Generation) -> None:
                 keep(generation)
@@ -106,7 +116,8 @@ class Search(EnvironmentOptions, Long):
         source = f"output = {str(path)!r}"
         result = checked(list[rule_search.Generation], content.get("generations"), source)
         numbers = [generation.number for generation in result]
-        if numbers != list(range(min(len(numbers), self.generations))):
+        count = self.generations * (1 if self.rule is None else self.prices)
+        if numbers != list(range(min(len(numbers), count))):
             raise ConfigurationError(f"{source} does not hold the first generations of a search")
         return result
 

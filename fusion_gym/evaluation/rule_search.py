@@ -1,21 +1,25 @@
-"""Search the numbers of the rule ``priced_threshold`` for several prices at once, by CMA-ES.
+"""Search the parameters of a rule by CMA-ES.
 
     search = search_of_class("scheduler", task, prices=(0.003, 0.01, 0.03, 0.1))
     result = search_rule(search)
-    policy = make_policy(result.policy, task)
+    policy = make_policy(result.policies[0], task)
 
-The search starts with the best single threshold at each price, and the power of the price that fits
-these thresholds. Every generation uses fresh episodes, and their number grows. The result is the
-mean of the means of the second half of the generations.
+``priced_threshold`` is searched for all prices at once. The search starts with the best single
+threshold at each price, and the power of the price that fits these thresholds. Any other rule whose
+parameters declare a range (:class:`~fusion_gym.policies.base.SearchRange`) is searched at each
+price, from the best value of its first parameter. Every generation uses fresh episodes, and their
+number grows. The result is the mean of the means of the second half of the generations.
 
 Source: N. Hansen and A. Ostermeier, "Completely derandomized self-adaptation in evolution
 strategies", Evolutionary Computation 9, 2001, as in the package cmaes.
 """
 
+from __future__ import annotations
+
 import functools
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,11 +28,12 @@ from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_priced, run_several
+from fusion_gym.evaluation.episodes import run_several
 from fusion_gym.evaluation.rule_loop import RuleLoop, make_loop
 from fusion_gym.importing import require
-from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.priced_threshold import PricedThreshold, Score, ThresholdNumbers
+from fusion_gym.policies.base import Policy, SearchRange
+from fusion_gym.policies.registry import make_policy, search_ranges, with_settings
+from fusion_gym.policies.rules.priced_threshold import PricedThreshold, Score
 from fusion_gym.validation import ConfigurationError
 
 ClassName = Literal["centre", "local", "scheduler"]
@@ -38,19 +43,9 @@ _SCORES: dict[ClassName, tuple[Score, ...]] = {
     "local": ("value", "innovation"),
     "scheduler": ("value",),
 }
-_RUNS = 2048  # in one batch; fixed, so that results do not depend on the machine
 _WIDE = 20.0  # a margin that hardly ever lets two sensors transmit in the same step
 _WORST = 1e30  # the cost of a candidate whose error is no number
-# Each coordinate's first standard deviation and limits; threshold and margin as logarithms.
-_RANGES = {
-    "threshold": (0.15, -np.inf, np.inf),
-    "price_exponent": (0.075, -1.0, 4.0),
-    "mixture": (0.1, 0.0, 1.0),
-    "token_exponent": (0.15, -3.0, 3.0),
-    "age_exponent": (0.1, -3.0, 3.0),
-    "margin": (0.15, 0.0, 4.0),
-    "margin_exponent": (0.075, -3.0, 3.0),
-}
+_FIRST = 24, 48  # values of the first sweep, of a priced_threshold and of another rule
 
 
 @dataclass(frozen=True)
@@ -89,13 +84,13 @@ class SearchResult:
     """The result of a search.
 
     Args:
-        policy: the rule as text.
+        policies: the rule at each price as text.
         prices: prices of a token.
         costs: cost of the rule at each price, on fresh episodes.
         threshold_costs: cost of the best single threshold at each price, on the same episodes.
     """
 
-    policy: str
+    policies: tuple[str, ...]
     prices: tuple[float, ...]
     costs: tuple[float, ...]
     threshold_costs: tuple[float, ...]
@@ -108,27 +103,28 @@ class SearchResult:
 
 @dataclass(frozen=True)
 class RuleSearch:
-    """A search of one rule for all prices.
+    """A search of a rule for all prices.
 
     Args:
         task: the task.
         prices: prices of a token, > 0 and different.
-        own: whether every sensor decides locally.
-        score: score of the rule, as in :class:`PricedThreshold`.
-        bounds: least and largest threshold of the first sweep; derived from the prices by default.
+        rule: text of the rule; the search leaves the parameters that it sets.
+        parameters: names of the searched parameters; by default all that declare a range.
+        bounds: least and largest value of the first sweep; derived from the prices or from the
+            range of the first parameter by default.
         generations: number of generations.
         population: candidates of a generation, >= 3.
         episodes: episodes of the first and of the last generation.
         seed: seed of the first episode and of the candidates.
 
     Raises:
-        ConfigurationError: a value that is not allowed.
+        ConfigurationError: a value that is not allowed, or a rule without a range.
     """
 
     task: Task = field(repr=False)
     prices: tuple[float, ...]
-    own: bool = False
-    score: Score = "value"
+    rule: str = "priced_threshold"
+    parameters: tuple[str, ...] = ()
     bounds: tuple[float, float] | None = None
     generations: int = 30
     population: int = 12
@@ -143,12 +139,50 @@ class RuleSearch:
             validation.integer(name, getattr(self, name), at_least=least)
         for count in self.episodes:
             validation.integer("episodes", count, at_least=1)
-        PricedThreshold(self.task, own=self.own, score=self.score)
+        if not self.ranges:
+            raise validation.refusal("rule", self.rule, "a rule with parameters to search")
+
+    @functools.cached_property
+    def base(self) -> Any:
+        """The rule with the parameters that the search leaves."""
+        return make_policy(self.text, self.task)
+
+    @functools.cached_property
+    def text(self) -> str:
+        """The text of the rule without the searched parameters."""
+        every = search_ranges(self.rule)
+        single = {name: f"{own.low:g}" for name, own in every.items() if own.low == own.high}
+        return with_settings(self.rule, single)
+
+    @functools.cached_property
+    def ranges(self) -> dict[str, SearchRange]:
+        """The range of each searched parameter, in the order of the rule's parameters."""
+        every, idle = search_ranges(self.text), set[str]()
+        if every and self.joint:
+            alone = self.base.own or self.task.sensors == 1
+            idle |= {"price_exponent", "margin_exponent"} if len(self.prices) == 1 else set()
+            idle |= {"token_exponent"} if self.task.network.bucket.unlimited else set()
+            idle |= {"margin", "margin_exponent"} if alone else set()
+        if unknown := set(self.parameters) - every.keys():
+            allowed = f"names of {', '.join(every)}"
+            raise validation.refusal("parameters", sorted(unknown), allowed)
+        names = [name for name in every if name in (self.parameters or every)]
+        return {name: every[name] for name in names if name not in idle}
 
     @property
-    def text(self) -> str:
-        """The text of the policy without its numbers."""
-        return f"priced_threshold:own={str(self.own).lower()},score={self.score}"
+    def joint(self) -> bool:
+        """Whether one rule serves all prices."""
+        return isinstance(self.base, PricedThreshold)
+
+    @property
+    def parts(self) -> tuple[RuleSearch, ...]:
+        """The searches of all prices, or of each price, with one first sweep."""
+        if self.joint:
+            return (self,)
+        parts = tuple(replace(self, prices=(price,)) for price in self.prices)
+        for part in parts:
+            vars(part).update(sweeps=self.sweeps, loop=self.loop)
+        return parts
 
     @property
     def reference_price(self) -> float:
@@ -157,73 +191,103 @@ class RuleSearch:
 
     @functools.cached_property
     def coordinates(self) -> tuple[str, ...]:
-        """The name of the number of each coordinate; the sensors follow one another."""
-        task = self.task
-        per_sensor = ["threshold", "price_exponent"] if len(self.prices) > 1 else ["threshold"]
-        names = [name for name in per_sensor for _ in range(task.sensors)]
-        names += ["mixture"] if task.network.bucket.unlimited else ["mixture", "token_exponent"]
-        names.append("age_exponent")
-        if task.sensors > 1 and not self.own:
-            names += ["margin", "margin_exponent"] if len(self.prices) > 1 else ["margin"]
-        return tuple(names)
+        """The parameter of each coordinate; the sensors follow one another."""
+        every = self.ranges.items()
+        sizes = {name: self.task.sensors if own.per_sensor else 1 for name, own in every}
+        return tuple(name for name, size in sizes.items() for _ in range(size))
+
+    @functools.cached_property
+    def sweeps(self) -> tuple[list[ThresholdTrial], ...]:
+        """The first parameter's values, for all sensors alike.
+
+        A priced_threshold has a sweep of each score, with and without a wide margin.
+        """
+        name, own = next(iter(self.ranges.items()))
+        low, high = self.bounds or own[:2]
+        if self.joint:
+            worth = np.array(self.prices) * self.task.network.bucket.cost / self.task.error_scale
+            low, high = self.bounds or (worth.min() / 30.0, worth.max() * 3.0)
+        first, last = own.coordinate(np.array([low, high]))
+        values = np.unique(own.value(np.linspace(first, last, _FIRST[not self.joint])))
+        if self.joint:
+            margins = (1.0, _WIDE) if "margin" in self.ranges else (1.0,)
+            fixed = [{"mixture": share, "price_exponent": 0.0} for share in (0.0, 1.0)]
+            every = [
+                [one | {"margin": s, name: v} for s in margins for v in values] for one in fixed
+            ]
+        else:
+            points = np.tile(self._point(self.base, {}), (len(values), 1))
+            points[:, np.array(self.coordinates) == name] = own.coordinate(values)[:, None]
+            every = [[self.values(point[None]) for point in points]]
+        count, sweeps = 2 * self.episodes[1], []
+        for texts in ([with_settings(self.text, one) for one in some] for some in every):
+            thresholds = np.resize(values, len(texts)).tolist()
+            sweeps.append(_try(self.task, texts, thresholds, count, self.seed, self.loop))
+        return tuple(sweeps)
 
     @functools.cached_property
     def start(self) -> tuple[ThresholdTrial, ...]:
-        """The best single threshold at each price, with or without a wide margin."""
-        worth = np.array(self.prices) * self.task.network.bucket.cost / self.task.error_scale
-        low, high = self.bounds or (worth.min() / 30.0, worth.max() * 3.0)
-        values = np.geomspace(low, high, 24).tolist()
-        margins = (1.0, _WIDE) if "margin" in self.coordinates else (1.0,)
-        trials = []
-        for margin in margins:
-            text = f"{self.text},price_exponent=0,margin={margin},threshold={{value}}"
-            count = 2 * self.episodes[1]
-            trials += try_thresholds(self.task, text, values, count, self.seed, self.loop)
-        return tuple(min(trials, key=lambda t: t.cost(price)) for price in self.prices)
+        """The best trial at each price, of the sweep that costs least at all prices."""
+        starts = (
+            tuple(min(sweep, key=lambda t: t.cost(price)) for price in self.prices)
+            for sweep in self.sweeps
+        )
+        return min(starts, key=lambda trials: float(np.log(self.start_costs(trials)).sum()))
 
     @functools.cached_property
     def loop(self) -> RuleLoop | None:
         """The loop of the rule in machine code, where it saves time."""
-        rule = PricedThreshold(self.task, own=self.own, score=self.score)
+        if not is_dataclass(self.base):
+            return None
         runs = self.generations * self.population * len(self.prices) * self.episodes[0]
-        sizes = Counter((*self.coordinates, "reference_price"))
-        return make_loop(self.task, rule, sizes, runs * self.task.horizon)
+        sizes = Counter((*self.coordinates, *(("reference_price",) if self.joint else ())))
+        return make_loop(self.task, self.base, sizes, runs * self.task.horizon)
 
     def start_costs(self, trials: Sequence[ThresholdTrial]) -> Array:
         """Return the costs of the trials, each at its price."""
         return np.array([t.cost(p) for t, p in zip(trials, self.prices, strict=True)])
 
     def first_point(self) -> Array:
-        """Return the start in coordinates: the powers of the price that fit its numbers best."""
+        """Return the start in coordinates: the powers of the price that fit the start best."""
         ratio = np.log(np.array(self.prices) / self.reference_price)
-        values = dict[str, float]()
+        rules: list[Any] = [make_policy(trial.policy, self.task) for trial in self.start]
+        fitted = dict[str, float]()
         for name, exponent in (("threshold", "price_exponent"), ("margin", "margin_exponent")):
-            rules: list[Any] = [make_policy(trial.policy, self.task) for trial in self.start]
-            logs = np.log([getattr(rule, name) for rule in rules])
-            slope = float(ratio @ logs) / float(ratio @ ratio) if len(ratio) > 1 else 1.0
-            values |= {exponent: slope, name: (logs - slope * ratio).mean()}
-        limits = (_RANGES[name][1:] for name in self.coordinates)
-        start = zip(self.coordinates, limits, strict=True)
-        return np.array([np.clip(values.get(name, 0.0), *ends) for name, ends in start])
+            if self.joint:
+                logs = np.log([getattr(rule, name) for rule in rules])
+                slope = float(ratio @ logs) / float(ratio @ ratio) if len(ratio) > 1 else 1.0
+                fitted |= {exponent: slope, name: (logs - slope * ratio).mean()}
+        return self._point(rules[0], fitted)
 
-    def rule(self, point: Array) -> str:
-        """Return the rule of a point (coordinates,) as text."""
-        settings = {"reference_price": self.reference_price, **self.numbers(point[None])._asdict()}
-        texts = (
-            f"{name}={'/'.join(f'{value:.5g}' for value in np.ravel(column))}"
-            for name, column in settings.items()
-        )
-        return ",".join((self.text, *texts))
+    def _point(self, rule: Any, fitted: dict[str, float]) -> Array:
+        """Return the coordinates of a rule, with fitted ones in the place of its own."""
+        point = list[float]()
+        for name, own in self.ranges.items():
+            value = getattr(rule, name)
+            value = fitted.get(name, own.coordinate(self.task.horizon if value is None else value))
+            value = np.clip(value, *own.coordinate(np.array(own[:2])))
+            point += np.broadcast_to(value, self.coordinates.count(name)).tolist()
+        return np.array(point)
 
-    def numbers(self, points: Array) -> ThresholdNumbers:
-        """Return the numbers (…, K) of K points (K, coordinates)."""
+    def values(self, points: Array) -> dict[str, Array]:
+        """Return the parameters (size, K) of K points (K, coordinates), nearest allowed ones."""
         names = np.array(self.coordinates)
-        none = np.zeros((1, len(points)))
-        columns = dict.fromkeys(ThresholdNumbers._fields, none) | {"price_exponent": none + 1.0}
-        columns |= {name: points[:, names == name].T for name in self.coordinates}
-        for name in ("threshold", "margin"):
-            columns[name] = np.exp(columns[name])
-        return ThresholdNumbers(**columns)
+        columns = {name: own.value(points[:, names == name].T) for name, own in self.ranges.items()}
+        allowed: dict[str, Array] = getattr(self.base, "admissible", lambda some: some)(columns)
+        return allowed
+
+    def policy(self, point: Array) -> str:
+        """Return the rule of a point (coordinates,) as text."""
+        fixed = {"reference_price": self.reference_price} if self.joint else {}
+        return with_settings(self.text, fixed | self.values(point[None]))
+
+    def rules(self, values: dict[str, Array], price: float) -> list[Policy]:
+        """Return the rules of parameters (size, K) at a price."""
+        fixed = {"reference_price": self.reference_price, "price": price} if self.joint else {}
+        count = next(iter(values.values())).shape[1]
+        every = (fixed | {name: c[:, k] for name, c in values.items()} for k in range(count))
+        texts = (with_settings(self.text, some, digits=17) for some in every)
+        return [make_policy(text, self.task, trial=False) for text in texts]
 
 
 def class_of(task: Task, local: bool) -> ClassName:
@@ -247,8 +311,9 @@ def search_of_class(
     Raises:
         ConfigurationError: a value that is not allowed, or a task without such rules.
     """
+    own = str(name == "local").lower()
     searches = [
-        RuleSearch(task, tuple(prices), name == "local", score, **options)
+        RuleSearch(task, tuple(prices), f"priced_threshold:own={own},score={score}", **options)
         for score in _SCORES[name]
     ]
     if len(searches) == 1:
@@ -268,6 +333,17 @@ def try_thresholds(
     if "{value}" not in template:
         raise validation.refusal("template", template, "a policy with {value} as its threshold")
     texts = [template.replace("{value}", f"{value:.5g}") for value in values]
+    return _try(task, texts, values, episodes, seed, loop)
+
+
+def _try(
+    task: Task,
+    texts: Sequence[str],
+    values: Sequence[float],
+    episodes: int,
+    seed: int,
+    loop: RuleLoop | None,
+) -> list[ThresholdTrial]:
     rules = [make_policy(text, task) for text in texts]
     error, tokens = _means(task, rules, episodes, seed, loop)
     error = np.nan_to_num(error, nan=_WORST, posinf=_WORST)
@@ -292,7 +368,7 @@ def _means(
         loop = make_loop(task, rule, sizes, len(rules) * episodes * task.horizon)
     if loop is not None:
         values = {
-            name: np.array([np.broadcast_to(getattr(own, name), size) for own in rules]).T
+            name: np.array([np.broadcast_to(_number(getattr(own, name)), size) for own in rules]).T
             for name, size in loop.sizes.items()
         }
         values = {name: column.repeat(episodes, axis=1) for name, column in values.items()}
@@ -301,10 +377,13 @@ def _means(
         prices = task.reward.price.draw(np.array(uniform))
         costs = loop.costs(values, np.tile(seeds, len(rules)), np.tile(prices, len(rules)))
         return costs.reshape(2, len(rules), episodes).mean(-1)
-    size, briefs = max(_RUNS // episodes, 1), list[EpisodeResults]()
-    for first in range(0, len(rules), size):
-        briefs += run_several(task, rules[first : first + size], episodes, seed)
-    return np.array([(brief.error_cost.mean(), brief.tokens.mean()) for brief in briefs]).T
+    return _run(task, rules, episodes, seed)
+
+
+def _run(task: Task, rules: Sequence[Any], episodes: int, seed: int) -> Array:
+    """Return the error and the tokens (2, rules) of each rule under NumPy."""
+    results = run_several(task, rules, episodes, seed)
+    return np.array([(result.error_cost.mean(), result.tokens.mean()) for result in results]).T
 
 
 def search_rule(
@@ -334,23 +413,32 @@ def search_rule(
 def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> Iterator[Generation]:
     """Yield the generations of a search after the earlier ones."""
     require("the search of a rule", "agents", "cmaes")
+    count = search.generations
+    for place, part in enumerate(search.parts):
+        yield from _run_part(part, earlier[place * count : (place + 1) * count], place * count)
+
+
+def _run_part(part: RuleSearch, earlier: Sequence[Generation], before: int) -> Iterator[Generation]:
+    """Yield the generations of one search after the earlier ones; others came ``before``."""
     from cmaes import CMA
 
-    ranges = np.array([_RANGES[name] for name in search.coordinates])
-    scale, limits = ranges[:, 0], ranges[:, 1:] / ranges[:, :1]
-    seed, size = search.seed, search.population
-    optimiser = CMA(search.first_point() / scale, 1.0, limits, 100, seed % 2**32, size)
-    seed += 2 * search.episodes[1]  # after the start's
-    for number in range(search.generations):
-        share = number / max(search.generations - 1, 1)
-        episodes = round(search.episodes[0] * (search.episodes[1] / search.episodes[0]) ** share)
+    ranges = [part.ranges[name] for name in part.coordinates]
+    scale = np.array([own.deviation for own in ranges])
+    limits = np.array([own.coordinate(np.array(own[:2])) for own in ranges]) / scale[:, None]
+    seed, size = part.seed, part.population
+    optimiser = CMA(part.first_point() / scale, 1.0, limits, 100, seed % 2**32, size)
+    seed += 2 * part.episodes[1]  # after the start's
+    for number in range(part.generations):
+        share = number / max(part.generations - 1, 1)
+        episodes = round(part.episodes[0] * (part.episodes[1] / part.episodes[0]) ** share)
         points = [optimiser.ask() for _ in range(size)]
         if number < len(earlier):
             objectives = tuple(earlier[number].objectives)
         else:
-            objectives = _objectives(search, np.array(points) * scale, episodes, seed)
+            objectives = _objectives(part, np.array(points) * scale, episodes, seed)
         optimiser.tell(list(zip(points, objectives, strict=True)))
-        generation = Generation(number, objectives, tuple((optimiser.mean * scale).tolist()))
+        mean = tuple((optimiser.mean * scale).tolist())
+        generation = Generation(before + number, objectives, mean)
         if number >= len(earlier):
             yield generation
         elif not np.allclose(generation.mean, earlier[number].mean):
@@ -363,43 +451,45 @@ def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> I
 
 def search_result(search: RuleSearch, generations: Sequence[Generation]) -> SearchResult:
     """Measure the mean of the second half of the generations' means on fresh episodes."""
-    if not generations:
-        raise validation.refusal("generations", generations, "one or more")
-    mean = np.mean([item.mean for item in generations[len(generations) // 2 :]], axis=0)
-    policy = search.rule(mean)
+    policies, costs = list[str](), list[float]()
     episodes = 4 * search.episodes[1]
     seed = search.seed + (2 + search.generations) * search.episodes[1]
-    rule: Any = make_policy(policy, search.task)
-    costs = _costs(search, rule.numbers, episodes, seed)[0]
+    for place, part in enumerate(search.parts):
+        own = generations[place * search.generations : (place + 1) * search.generations]
+        if not own:
+            raise validation.refusal("generations", generations, "one or more at each price")
+        mean = np.mean([item.mean for item in own[len(own) // 2 :]], axis=0)
+        policies += [part.policy(mean)] * len(part.prices)
+        costs += _costs(part, mean[None], episodes, seed)[0].tolist()
     single: list[Any] = [make_policy(item.policy, search.task) for item in search.start]
     error, tokens = _means(search.task, single, episodes, seed, search.loop)
     references = error + np.array(search.prices) * tokens
-    return SearchResult(policy, search.prices, tuple(costs.tolist()), tuple(references.tolist()))
+    return SearchResult(tuple(policies), search.prices, tuple(costs), tuple(references.tolist()))
 
 
 def _objectives(search: RuleSearch, points: Array, episodes: int, seed: int) -> tuple[float, ...]:
     """Return each point's cost over the cost of the best single threshold, averaged over prices."""
-    costs = _costs(search, search.numbers(points), episodes, seed)
+    costs = _costs(search, points, episodes, seed)
     return tuple((costs / search.start_costs(search.start)).mean(-1).tolist())
 
 
-def _costs(search: RuleSearch, numbers: ThresholdNumbers, episodes: int, seed: int) -> Array:
-    """Return the costs (K, prices) of the numbers (…, K), on the same episodes."""
-    shape = (numbers.margin.shape[-1], len(search.prices), episodes)
-    candidate, price, episode = (place.ravel() for place in np.indices(shape))
-    seeds, prices = seed + episode, np.array(search.prices)[price]
-    if search.loop is not None:
-        columns = numbers._asdict()
-        columns |= {"reference_price": np.full(shape[:1], search.reference_price)[None]}
-        values = {name: columns[name][:, candidate] for name in search.loop.sizes}
-        error, tokens = search.loop.costs(values, seeds, prices)
-        costs = error + prices * tokens
+def _costs(search: RuleSearch, points: Array, episodes: int, seed: int) -> Array:
+    """Return the costs (K, prices) of K points (K, coordinates), on the same episodes."""
+    values, prices = search.values(points), np.array(search.prices)
+    if search.loop is None:
+        rules = [rule for price in search.prices for rule in search.rules(values, price)]
+        error, tokens = _run(search.task, rules, episodes, seed).reshape(2, len(prices), -1)
+        costs = (error + prices[:, None] * tokens).T
     else:
-        policy = PricedThreshold(search.task, own=search.own, score=search.score)
-        policy.reference_price, costs = search.reference_price, np.empty(len(candidate))
-        for first in range(0, len(costs), _RUNS):
-            part = slice(first, first + _RUNS)
-            policy.numbers = ThresholdNumbers(*(column[:, candidate[part]] for column in numbers))
-            own = prices[part]
-            costs[part] = run_priced(search.task, policy, seeds[part], own).cost(own)
-    return np.nan_to_num(costs, nan=_WORST, posinf=_WORST).reshape(shape).mean(-1)
+        shape = (len(points), len(prices), episodes)
+        candidate, price, episode = (place.ravel() for place in np.indices(shape))
+        values |= {"reference_price": np.full((1, len(points)), search.reference_price)}
+        columns = {name: values[name][:, candidate] for name in search.loop.sizes}
+        error, tokens = search.loop.costs(columns, seed + episode, prices[price])
+        costs = (error + prices[price] * tokens).reshape(shape).mean(-1)
+    return np.nan_to_num(costs, nan=_WORST, posinf=_WORST)
+
+
+def _number(value: Any) -> Any:
+    """Return a parameter as numbers; ``None``, no limit, is infinite."""
+    return np.inf if value is None else value

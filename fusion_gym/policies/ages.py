@@ -12,7 +12,14 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests, Stateless, check_at_most, check_price, strongest
+from fusion_gym.policies.base import (
+    PRICE,
+    Requests,
+    Stateless,
+    check_at_most,
+    check_price,
+    strongest,
+)
 from fusion_gym.solvers.ages import AgeSolution, AgeSource, age_index, age_sources, solve_ages
 
 _index_of: dict[bytes, Array] = {}  # by source
@@ -65,6 +72,8 @@ class AgeIndex(Stateless):
 
     knowledge: ClassVar[Knowledge] = "centre"
 
+    search = PRICE
+
     def __init__(
         self,
         task: Task,
@@ -76,7 +85,7 @@ class AgeIndex(Stateless):
         validation.integer("longest", longest, at_least=2, at_most=200)
         check_price("price", price)
         fixed = task.reward.price.fixed if price is None else price
-        self._price = validation.number("price", fixed, at_least=0.0)
+        self.price = validation.number("price", fixed, at_least=0.0)
         self._at_most, self._cost = _limit(task, at_most), task.network.bucket.cost
         self._by_channel = task.network.rule.by_channel
         self._sources = age_sources(task, longest)
@@ -98,7 +107,7 @@ class AgeIndex(Stateless):
         parts = zip(self._sources, self.tables, age.repeat(links, axis=0), states, strict=True)
         index = np.stack([table[_places(source, a), s] for source, table, a, s in parts])
         grantable = signals["grantable"].repeat(links, axis=0)
-        worth = grantable & (index >= self._price * self._cost.repeat(links, axis=0))
+        worth = grantable & (index >= self.price * self._cost.repeat(links, axis=0))
         if not self._by_channel:
             return strongest(index, worth, self._at_most, age)
         shape = (len(age), links, age.shape[-1])

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Protocol, get_args
+from typing import Any, ClassVar, NamedTuple, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +113,78 @@ def decide(policy: Policy, batch: EpisodeBatch, seed: int) -> Iterator[Requests]
         yield decision(batch.signals())
 
 
+class SearchRange(NamedTuple):
+    """Where :mod:`fusion_gym.evaluation.rule_search` looks for a parameter.
+
+    Args:
+        low: least value; equal ends fix a parameter whose unit another one has too.
+        high: largest value.
+        per_sensor: whether every sensor has a value of its own.
+        logarithmic: whether the search moves the logarithm.
+        deviation: first standard deviation, of the logarithm if that moves.
+        whole: whether the values are whole numbers.
+
+    Example:
+        >>> from fusion_gym.policies.base import SearchRange
+        >>> SearchRange(1, 100, whole=True).value(np.log([2.2, 7.9])).tolist()
+        [2, 8]
+    """
+
+    low: float
+    high: float
+    per_sensor: bool = True
+    logarithmic: bool = True
+    deviation: float = 0.3
+    whole: bool = False
+
+    def coordinate(self, value: Any) -> Any:
+        """Return the coordinate of a value."""
+        with np.errstate(divide="ignore"):
+            return np.log(value) if self.logarithmic else value
+
+    def value(self, coordinate: Array) -> Array:
+        """Return the value of a coordinate, within the range."""
+        value = np.exp(coordinate) if self.logarithmic else coordinate
+        value = np.clip(value, self.low, self.high)
+        return np.rint(value).astype(np.int64) if self.whole else value
+
+
+THRESHOLD = SearchRange(1e-4, 1e4)
+SHARED_THRESHOLD = THRESHOLD._replace(per_sensor=False)
+PRICE = {"price": SHARED_THRESHOLD}  # of policies without fields
+INTERVAL = SearchRange(1, 1000, per_sensor=False, whole=True)
+
+
+def parameter(
+    default: Any, check: Callable[..., Any], search: SearchRange | None = None, **limits: Any
+) -> Any:
+    """Return the field of a parameter with its default and ``check(name, value, **limits)``.
+
+    Args:
+        default: the default value.
+        check: function that refuses a value, such as a check of :mod:`fusion_gym.validation`.
+        search: where a search looks for it; None leaves it.
+        **limits: keywords of the check.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> from fusion_gym import Rule, parameter, validation
+        >>> @dataclass
+        ... class Late(Rule):
+        ...     steps: int = parameter(5, validation.integer, at_least=1)
+        >>> Late().steps
+        5
+    """
+    check = functools.partial(check, **limits)
+    return dataclasses.field(default=default, metadata={"check": check, "search": search})
+
+
+def check_interval(name: str, value: int | None) -> None:
+    """Check a largest number of steps: a whole number >= 1, or None for no limit."""
+    if value is not None:
+        validation.integer(name, value, at_least=1)
+
+
 class Stateless:
     """Base class of policies that have no memory and draw nothing."""
 
@@ -175,6 +247,10 @@ class Rule:
             return xp.broadcast_to(value, (sensors,))[:, None]
         return validation.spread(name, value, (sensors,))[:, None]
 
+    def admissible(self, values: dict[str, Array]) -> dict[str, Array]:
+        """Return parameters (size, K) that a search tries as the nearest allowed ones."""
+        return values
+
     def reset(self, runs: int, seed: int = 0) -> None:
         """Clear the variables of the rule; the base class has none."""
 
@@ -195,20 +271,27 @@ class LocalRule(Rule):
         ConfigurationError: an interval below 1, or a max_interval below min_interval.
     """
 
-    min_interval: int = 1
-    max_interval: int | None = None
+    min_interval: int = parameter(1, validation.integer, INTERVAL, at_least=1)
+    max_interval: int | None = parameter(None, check_interval, INTERVAL)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        least = validation.integer("min_interval", self.min_interval, at_least=1)
-        if self.max_interval is not None:
-            validation.integer("max_interval", self.max_interval, at_least=least)
+        pair = self.min_interval, self.max_interval
+        if self.max_interval is not None and namespace(*pair) is np:
+            validation.integer("max_interval", self.max_interval, at_least=self.min_interval)
+
+    def admissible(self, values: dict[str, Array]) -> dict[str, Array]:
+        """Return parameters with max_interval at least min_interval."""
+        if "max_interval" in values:
+            least = values.get("min_interval", np.array(self.min_interval))
+            values |= {"max_interval": np.maximum(values["max_interval"], least)}
+        return values
 
     def limit(self, requests: Requests, signals: Signals) -> Requests:
         """Return the requests (sensors, N) within the intervals."""
         if self.max_interval is not None:
             requests = requests | (signals["age"] >= self.max_interval)
-        if self.min_interval > 1:
+        if namespace(self.min_interval) is not np or self.min_interval > 1:
             requests = requests & (signals["age"] >= self.min_interval)
         return requests
 
@@ -238,27 +321,6 @@ class ChanceRule(Rule):
             self._drawn, self._used = np.stack(drawn, axis=-1), 0
         self._used += 1
         return self._drawn[self._used - 1]
-
-
-def parameter(default: Any, check: Callable[..., Any], **limits: Any) -> Any:
-    """Return the field of a parameter with its default and ``check(name, value, **limits)``.
-
-    Args:
-        default: the default value.
-        check: function that refuses a value, such as a check of :mod:`fusion_gym.validation`.
-        **limits: keywords of the check.
-
-    Example:
-        >>> from dataclasses import dataclass
-        >>> from fusion_gym import Rule, parameter, validation
-        >>> @dataclass
-        ... class Late(Rule):
-        ...     steps: int = parameter(5, validation.integer, at_least=1)
-        >>> Late().steps
-        5
-    """
-    check = functools.partial(check, **limits)
-    return dataclasses.field(default=default, metadata={"check": check})
 
 
 def not_negative_parameter(name: str, value: Any) -> None:

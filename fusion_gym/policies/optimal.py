@@ -11,7 +11,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests, Stateless, check_at_most, strongest
+from fusion_gym.policies.base import PRICE, Requests, Stateless, check_at_most, strongest
 from fusion_gym.solvers.single import solve_average
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.task import solve_task, source_problems
@@ -156,12 +156,14 @@ class WhittleIndex(Stateless):
     Example: ``whittle:price=5`` in ``fusion_gym/RemoteEstimation-v1 sensors=2 cost_weight=5.0``.
     """
 
+    search = PRICE
+
     def __init__(self, task: Task, price: float | None = None, at_most: int | None = None) -> None:
         check_at_most("at_most", at_most)
         problems = source_problems(task)
         self._at_most = 1 if at_most is None and task.network.access == "single" else at_most
         fixed = task.reward.price.fixed if price is None else price
-        self._price = validation.number("price", fixed, at_least=0.0)
+        self.price = validation.number("price", fixed, at_least=0.0)
         self._cost = task.network.bucket.cost
         self._tables = [index_table(number, problem) for number, problem in enumerate(problems)]
 
@@ -173,7 +175,7 @@ class WhittleIndex(Stateless):
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         index = self.index(signals["innovation"][:, 0], signals["channel_state"]) / self._cost
-        return strongest(index, index >= self._price, self._at_most, signals["age"])
+        return strongest(index, index >= self.price, self._at_most, signals["age"])
 
     def index(self, error: Array, channel: NDArray[np.int64]) -> Array:
         """Return the price of a transmission (sensors, N) at which each source is indifferent.

@@ -9,7 +9,7 @@ import dataclasses
 import importlib
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
@@ -19,7 +19,7 @@ from fusion_gym.core.knowledge import KNOWLEDGE, SignalError
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
 from fusion_gym.importing import TRUST, import_named
-from fusion_gym.policies.base import Policy, guard, owner_of
+from fusion_gym.policies.base import Policy, SearchRange, guard, owner_of
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys, refusal
 
@@ -154,8 +154,34 @@ def policy_parameters(name: str) -> dict[str, inspect.Parameter]:
     return _parameters(name, policy_maker(name))
 
 
-def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
-    """Return the policy of a text, after a trial call on one run of the task.
+def search_ranges(spec: str) -> dict[str, SearchRange]:
+    """Return the ranges of the parameters that the text of a rule leaves, its own ones first."""
+    _, row, text = _parse_policy(spec)
+    if row.kind == "agent":
+        return {}
+    maker: Any = _maker(row)
+    ranges: dict[str, SearchRange] = dict(getattr(maker, "search", {}))
+    if dataclasses.is_dataclass(maker):
+        own = sorted(dataclasses.fields(maker), key=lambda field: bool(field.kw_only))
+        ranges |= {field.name: field.metadata["search"] for field in own if field.metadata}
+    settings = parse_settings("parameter", text.split(",") if text else [])
+    return {name: own for name, own in ranges.items() if own and name not in settings}
+
+
+def with_settings(spec: str, settings: Mapping[str, Any], digits: int = 5) -> str:
+    """Return the text of a policy with further settings: texts, or numbers with so many digits."""
+    texts = {
+        name: value
+        if isinstance(value, str)
+        else "/".join(f"{entry:.{digits}g}" for entry in np.ravel(value).tolist())
+        for name, value in settings.items()
+    }
+    joined = ",".join(f"{name}={text}" for name, text in texts.items())
+    return f"{spec}{',' if _parse_policy(spec)[2] else ':'}{joined}" if joined else spec
+
+
+def make_policy(spec: str, task: Task, *, trust: bool = False, trial: bool = True) -> Policy:
+    """Return the policy of a text.
 
     Parameters that the text does not set have the task's defaults (``task.policy_defaults``) or the
     maker's defaults.
@@ -164,6 +190,7 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
         spec: text of the policy, ``NAME`` or ``NAME:key=value,…``.
         task: the task, for example of :func:`~fusion_gym.make_task`.
         trust: whether ``model:PATH`` may run code of the file; otherwise the file is read as data.
+        trial: whether to call the policy once, which reports errors before long work begins.
 
     Returns:
         The policy, a function from signals to requests.
@@ -184,7 +211,7 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     if task.required_policy is not None:
         required = _make(task.required_policy, task.policy_defaults, context)
         _check_required(spec, policy, task, required)
-    if _parse_policy(spec)[1].kind != "agent":  # the loader has checked its observation
+    if trial and _parse_policy(spec)[1].kind != "agent":  # the loader has checked its observation
         _try_out(spec, policy, task)
     return policy
 

@@ -83,7 +83,7 @@ def calibrate(
     if rule is None:
         name, count = class_of(task, agents[0].view.rows_per_run > 1), (first, max(1, last // 4))
         search = search_of_class(name, task, prices, episodes=count)
-        rule = search.rule(search.first_point())
+        rule = search.policy(search.first_point())
     trial = _Trial(task, agents, (), calibrated.calibration_rule(rule, task), ())
     trial.slopes = fit_slopes(trial, prices, first)
     own = [(number, 0.0, 0.0) for number in range(len(agents))]

@@ -15,13 +15,13 @@ from paths import ROOT
 from scipy import stats
 
 import fusion_gym
-from agents.benchmark import evidence, rules, settings, verdict
+from agents import cache
+from agents.benchmark import evidence, rules, settings, training, verdict
 from agents.benchmark.report import draw_class, headline_text, mean_text
 from agents.benchmark.settings import CLASSES, knowledge_of, load_suite
 from agents.benchmark.verdict import cost_difference, discoveries, mean_difference
 from fusion_gym.core.knowledge import covers
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.rule_search import ThresholdTrial
 from fusion_gym.policies.registry import make_policy
 
 SMALL = {
@@ -235,20 +235,19 @@ def test_discoveries_are_those_of_the_procedure() -> None:
     assert discoveries([]) == []
 
 
-def test_prices_are_slopes_of_the_front(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where error = 1 / tokens, the best at price p spends p^(-1/2)."""
-    trials = [
-        ThresholdTrial(f"x:y={value}", value, value, 1.0 / value)
-        for value in np.geomspace(0.01, 1.0, 200).tolist()
-    ]
-    always = type("Brief", (), {"tokens": np.ones(3)})
-    monkeypatch.setattr(rules, "run_episodes", lambda *_: always)
-    monkeypatch.setattr(rules, "make_policy", lambda *_: None)
-    shares = (0.5, 0.25, 0.12, 0.06, 0.03)
-    job = rules.SweepJob(load_suite().settings[0], "scheduler", (), shares, (3, 3))
-    task: Any = None
-    prices = rules._prices(task, trials, job)
-    assert prices == pytest.approx([share**-2 for share in shares], rel=0.02)
+def test_another_rule_or_price_trains_nothing_again() -> None:
+    suite = load_suite()
+    setting, algorithm = suite.settings[0], suite.algorithm
+
+    def inputs(*prices: float, seed: int = 0) -> Any:
+        experiment = suite.experiment(setting, "local", prices, seed, algorithm, 1.0)
+        return training.TrainingJob(experiment, Path("anywhere"), 60.0).inputs
+
+    assert inputs(1.0, 2.0, 3.0) == inputs(1.0, 2.5, 3.0)
+    assert inputs(1.0, 3.0) != inputs(1.0, 4.0)
+    assert inputs(1.0, 3.0) != inputs(1.0, 3.0, seed=1)
+    imports = cache.read_module("agents.benchmark.training", Path(training.__file__))[1]
+    assert not [name for name in imports if name.startswith("agents")]
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ def test_the_line_is_a_policy_of_other_commands() -> None:
     generations, result = contents("made")
     assert [item["number"] for item in generations["generations"]] == [0, 1, 2]
     line, *table = ended.out.splitlines()
-    assert line == result["policy"]
+    assert [line] * 2 == result["policies"]
     assert line.startswith("priced_threshold:own=false,score=value,")
     for price, cost, single in zip(
         *(result[name] for name in ("prices", "costs", "threshold_costs")), strict=True
@@ -56,6 +56,28 @@ def test_the_line_is_a_policy_of_other_commands() -> None:
     assert "3/3 generations" in ended.err
     options = ["--set", "system=plant.yaml", "horizon=8", "--episodes", "2"]
     succeed("evaluate", ["--env", ENV, *options, "--policies", line])
+
+
+def test_any_rule_is_searched_at_each_price() -> None:
+    ended = succeed("search", words("made", "--rule", "report_on_change:min_interval=2"))
+    generations, result = contents("made")
+    assert [item["number"] for item in generations["generations"]] == [*range(6)]
+    lines = ended.out.splitlines()[:2]
+    assert lines == result["policies"]
+    for line in lines:
+        name, _, settings = line.partition(":")
+        change, interval = settings.removeprefix("min_interval=2,").split(",")
+        assert (name, len(change.split("/"))) == ("report_on_change", 2)
+        assert int(interval.removeprefix("max_interval=")) >= 2
+    assert "6/6 generations" in ended.err
+    options = ["--set", "system=plant.yaml", "horizon=8", "--episodes", "2"]
+    succeed("evaluate", ["--env", ENV, *options, "--policies", *lines])
+    for more, message in (
+        (("--rule", "always"), "rule = 'always' is not allowed: it must be a rule with parameters"),
+        (("--rule", "model:x.zip"), "rule = 'model:x.zip' is not allowed"),
+        (("--rule", "paced", "--class", "local"), "class = 'local' is not allowed with --rule"),
+    ):
+        assert message in refusal("search", words("other", *more))
 
 
 def test_compare_asks_the_rule_at_every_price() -> None:
@@ -71,7 +93,7 @@ def test_compare_asks_the_rule_at_every_price() -> None:
     sizes = ["--prices", "2", "--generations", "1"]
     line = succeed("search", ["--config", "training.yaml", "--output", "made", *sizes, *LOCAL])
     policy = line.out.splitlines()[0]
-    assert policy.startswith("priced_threshold:own=true,score=value,")
+    assert policy.startswith("priced_threshold:own=true,score=innovation,")
     assert contents("made")[1]["prices"] == [0.5, 2.0]
     files = ["--config", "training.yaml", "--sweep", "sweep.yaml", "--episodes", "4"]
     succeed("compare", [*files, "--policy", policy, "--prices", "3", "--output", "compared"])

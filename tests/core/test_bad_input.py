@@ -233,7 +233,7 @@ POLICIES: list[tuple[Any, ...]] = [
     (
         TOBIT,
         {},
-        "information_gain:threshold=0.1/0.2/0.3,at_most=none",
+        "centre_variance:threshold=0.1/0.2/0.3",
         "threshold = (0.1, 0.2, 0.3)",
     ),
     (TOBIT, {}, "innovation_threshold:at_most=0", "at_most = 0", "whole number >= 1"),

@@ -26,7 +26,7 @@ from fusion_gym.evaluation.rule_search import (
     try_thresholds,
 )
 from fusion_gym.policies.base import Requests, Rule, shape_of
-from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.registry import make_policy, policy_maker, policy_names, search_ranges
 from fusion_gym.policies.rules.measurements import InnovationThreshold
 from fusion_gym.validation import ConfigurationError
 
@@ -72,7 +72,7 @@ def test_a_search_from_a_bad_start_lowers_the_cost() -> None:
     assert all(len(generation.objectives) == 8 for generation in every)
     costs = np.zeros((2, len(PRICES)))
     for place, price in enumerate(PRICES):
-        policies = f"{result.policy},price={price}", search.start[place].policy
+        policies = f"{result.policies[place]},price={price}", search.start[place].policy
         for row, text in zip(costs, policies, strict=True):
             single = run_episodes(task_of(), make_policy(text, task_of()), 100, 0)
             row[place] = (single.error_cost + price * single.tokens).mean()
@@ -92,11 +92,10 @@ def test_a_resumed_search_is_the_uninterrupted_one() -> None:
     assert list(run_generations(small(), earlier)) == every[2:]
     result = search_rule(small(), earlier)
     assert result == search_result(small(), every) == search_rule(small(), every)
-    assert "score=value,reference_price=0.1,threshold=" in result.policy
-    make_policy(result.policy, task_of())
+    assert result.policies[0].startswith("priced_threshold:reference_price=0.1,threshold=")
+    make_policy(result.policies[0], task_of())
     refused(lambda: list(run_generations(small(seed=7), earlier)), "earlier[0]")
-    with pytest.raises(ConfigurationError, match=r"generations = .* it must be one or more$"):
-        search_result(small(), [])
+    refused(lambda: search_result(small(), []), "generations = [] ", "one or more at each price")
 
 
 @pytest.fixture
@@ -115,7 +114,6 @@ def seeds(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
         return [policy(task, None, episodes, seed)] * len(rules)
 
     monkeypatch.setattr(rule_search, "run_several", policies)
-    monkeypatch.setattr(rule_search, "run_priced", lambda task, policy, seeds, prices: means(seeds))
     return batches
 
 
@@ -134,7 +132,7 @@ def test_the_result_is_the_mean_of_the_second_half() -> None:
     means = [zero + value for value in (9.0, 7.0, 0.2, 0.4)]
     halves = [Generation(place, (), mean.tolist()) for place, mean in enumerate(means)]
     single = Generation(0, (), (zero + 0.3).tolist())
-    assert search_result(search, halves).policy == search_result(search, [single]).policy
+    assert search_result(search, halves).policies == search_result(search, [single]).policies
 
 
 def test_a_cost_without_number_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,15 +141,14 @@ def test_a_cost_without_number_is_the_worst(monkeypatch: pytest.MonkeyPatch) -> 
     singles = [ThresholdTrial("", 1.0, 10.0, error) for error in (0.9, 1.0, 0.0)]
     search.__dict__["start"] = tuple(singles)  # at the prices .01, .1, 1 they cost 1, 2, 10
 
-    def run(task: Task, policy: Any, seeds: Any, prices: Any) -> EpisodeResults:
-        error = np.ones(len(seeds))
-        error[policy.numbers.margin[0] > 5.0] = np.nan
-        error[policy.numbers.margin[0] < 0.5] = np.inf
-        return means_of(error, np.zeros(len(seeds)))
+    def run(task: Task, rules: Any, episodes: int, seed: int) -> list[EpisodeResults]:
+        errors = {1.0: 1.0, float(np.exp(2.0)): np.nan, float(np.exp(1.0)): np.inf}
+        every = (np.full(episodes, errors[rule.margin]) for rule in rules)
+        return [means_of(error, np.zeros(episodes)) for error in every]
 
-    monkeypatch.setattr(rule_search, "run_priced", run)
+    monkeypatch.setattr(rule_search, "run_several", run)
     points = np.zeros((3, len(search.coordinates)))
-    points[:, search.coordinates.index("margin")] = 0.0, 2.0, -2.0
+    points[:, search.coordinates.index("margin")] = 0.0, 2.0, 1.0
     costs = rule_search._objectives(search, points, 4, 0)
     assert costs[0] == pytest.approx((1.0 + 0.5 + 0.1) / 3.0)
     assert np.all((np.array(costs[1:]) > 1e29) & np.isfinite(costs[1:]))
@@ -233,7 +230,7 @@ def test_a_search_in_machine_code_is_the_search_of_numpy(monkeypatch: pytest.Mon
     for first, second in zip(numpy, ours, strict=True):
         np.testing.assert_allclose(second.objectives, first.objectives, rtol=1e-9)
         np.testing.assert_allclose(second.mean, first.mean, rtol=1e-7, atol=1e-9)
-    assert other.policy == one.policy
+    assert other.policies == one.policies
     np.testing.assert_allclose(other.costs, one.costs, rtol=1e-9)
     np.testing.assert_allclose(other.threshold_costs, one.threshold_costs, rtol=1e-12)
 
@@ -284,12 +281,13 @@ def test_numpy_runs_what_the_loop_does_not(
 def test_coordinates_are_those_that_matter() -> None:
     names = ("threshold",) * 3 + ("price_exponent",) * 3 + ("mixture", "token_exponent")
     assert small().coordinates == (*names, "age_exponent", "margin", "margin_exponent")
-    assert small(own=True).coordinates == (*names, "age_exponent")
+    own = small(rule="priced_threshold:own=true")
+    assert own.coordinates == (*names, "age_exponent")
     free = dataclasses.replace(small(), task=task_of(tokens="unlimited"), prices=(0.1,))
     assert free.coordinates == (*names[:3], "mixture", "age_exponent", "margin")
-    numbers = free.numbers(np.zeros((2, 6)))
-    assert [column.shape for column in numbers] == [(3, 2)] + [(1, 2)] * 6
-    assert [float(column[0, 0]) for column in numbers] == [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    values = free.values(np.zeros((2, 6)))
+    assert [column.shape for column in values.values()] == [(3, 2)] + [(1, 2)] * 3
+    assert [float(column[0, 0]) for column in values.values()] == [1.0, 0.0, 0.0, 1.0]
 
 
 def test_the_start_fits_the_margin_to_the_prices() -> None:
@@ -318,12 +316,12 @@ def test_a_class_is_searched_by_its_cheapest_score() -> None:
     search = search_of_class("local", task_of(), PRICES, **options)
     costs = {}
     for score in ("value", "innovation"):
-        single: Any = dataclasses.replace(search, score=score)
+        single: Any = dataclasses.replace(search, rule=f"priced_threshold:own=true,score={score}")
         costs[score] = np.log(single.start_costs(single.start)).sum()
-    assert search.own
-    assert search.score == min(costs, key=costs.__getitem__)
-    assert search_of_class("scheduler", task_of(), PRICES).score == "value"
-    assert search_of_class("centre", task_of(), PRICES).score == "variance"
+    text = "priced_threshold:own={},score={}".format
+    assert search.rule == text("true", min(costs, key=costs.__getitem__))
+    assert search_of_class("scheduler", task_of(), PRICES).rule == text("false", "value")
+    assert search_of_class("centre", task_of(), PRICES).rule == text("false", "variance")
 
 
 @pytest.mark.parametrize(
@@ -332,11 +330,12 @@ def test_a_class_is_searched_by_its_cheapest_score() -> None:
 )
 def test_other_scores_are_searched_too(options: dict[str, Any], score: Any) -> None:
     task = task_of(**options)
-    search = dataclasses.replace(small(bounds=(0.01, 10.0)), task=task, score=score, generations=2)
+    changes = {"rule": f"priced_threshold:score={score}", "generations": 2}
+    search = dataclasses.replace(small(bounds=(0.01, 10.0)), task=task, **changes)
     result = search_rule(search)
-    assert f"score={score}" in result.policy
+    assert f"score={score}" in result.policies[0]
     assert np.isfinite(result.costs).all()
-    policy: Any = make_policy(result.policy, task)
+    policy: Any = make_policy(result.policies[0], task)
     assert policy.knowledge == ("centre" if score == "variance" else "scheduler")
 
 
@@ -350,9 +349,81 @@ def test_other_scores_are_searched_too(options: dict[str, Any], score: Any) -> N
         ({"population": 2}, "population = 2"),
         ({"episodes": (0, 4)}, "episodes = 0"),
         ({"seed": -1}, "seed = -1"),
-        ({"score": "worth"}, "score = 'worth'"),
+        ({"rule": "priced_threshold:score=worth"}, "score = 'worth'"),
+        ({"rule": "never"}, "rule = 'never' is not allowed: it must be a rule with parameters"),
+        ({"parameters": ("price",)}, r"parameters = \['price'\] .* names of threshold, price_exp"),
     ],
 )
 def test_what_a_search_refuses(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         dataclasses.replace(small(), **changes)
+
+
+@pytest.mark.parametrize("name", policy_names())
+def test_the_ends_of_every_range_are_allowed(name: str) -> None:
+    """With the default between them, alone and with the other parameters at the same end."""
+    maker, ranges = policy_maker(name), search_ranges(name)
+    fields: dict[str, Any] = {}
+    if dataclasses.is_dataclass(maker):
+        fields = {field.name: field.default for field in dataclasses.fields(maker)}
+        task = {"task": task_of()} if "task" in fields else {}
+        for end in (0, 1):
+            ends = {n: own[end] for n, own in ranges.items() if np.isfinite(own[end])}
+            maker(**task, **ends)
+    for parameter, own in ranges.items():
+        value = fields.get(parameter)
+        fixed = own.low == own.high
+        assert value is None or fixed or own.low <= value <= own.high
+        if value is not None and own.logarithmic and own.low < value:
+            assert own.value(own.coordinate(np.array(value))) == pytest.approx(value)
+
+
+def test_the_parameters_of_a_search_are_allowed_together() -> None:
+    task = fusion_gym.make_task("fusion_gym/UnknownInput-v1", horizon=20)
+    search = RuleSearch(task, (0.1,), "adaptive_threshold", episodes=(2, 2))
+    assert search.text == "adaptive_threshold:scale=10000"
+    assert np.isfinite([trial.error for trial in search.start]).all()
+    assert (search.values(search.first_point()[None])["rho_bar"] <= 1.0).all()
+    points = np.random.default_rng(0).normal(0.0, 6.0, (50, len(search.coordinates)))
+    values = search.values(points)
+    assert (values["rho_initial"] <= values["rho_bar"]).all()
+    assert (values["rho_bar"] <= 1.0).all()
+    assert (values["max_interval"] >= values["min_interval"]).all()
+    assert values["min_interval"].dtype.kind == "i"
+    for point, rule in zip(points, search.rules(values, 0.1), strict=True):
+        same: Any = make_policy(search.policy(point), task)
+        assert same.rho_initial == pytest.approx(rule.rho_initial, rel=1e-4)
+        assert (same.min_interval, same.max_interval) == (rule.min_interval, rule.max_interval)
+
+
+def test_a_threshold_a_source_is_nearly_the_optimum() -> None:
+    """Two sources of different noise share nothing: each has an optimal threshold of its own."""
+    options = {"sensors": 2, "noise_deviation": (0.3, 3.0), "state_weights": (100.0, 0.01)}
+    options |= {"tokens": "unlimited", "horizon": 100}
+    task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", access="any", **options)
+    rule = "innovation_threshold:min_interval=1,max_interval=none"
+    search = RuleSearch(task, (1.0,), rule, generations=20, population=8, episodes=(4, 16))
+    result = search_rule(search)
+    best = run_episodes(task, make_policy("optimal:price=1", task), 64, 10**6)
+    optimum = float(best.cost(1.0).mean())
+    assert 0.95 * optimum < result.costs[0] < 1.05 * optimum
+    assert result.threshold_costs[0] > 1.2 * optimum
+
+
+def test_rules_with_variables_and_tables_are_searched_too() -> None:
+    task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", sensors=2, horizon=20)
+    for rule in ("dynamic_event", "whittle", "paced:staggered=false"):
+        search = RuleSearch(task, (0.5,), rule, generations=2, population=3, episodes=(2, 4))
+        result = search_rule(search)
+        assert make_policy(result.policies[0], task).knowledge
+        assert np.isfinite(result.costs).all()
+
+
+def test_a_search_starts_with_the_better_of_two_scores() -> None:
+    """Of the innovation in the sensor's unit and in deviations, whose start would cost more."""
+    task = fusion_gym.make_task("fusion_gym/CorrelatedTracking-v1", horizon=30, token_rate=3.0)
+    search = RuleSearch(task, (0.1, 2.0), "priced_threshold:score=innovation", episodes=(2, 8))
+    starts = [[min(t.cost(p) for t in sweep) for p in search.prices] for sweep in search.sweeps]
+    assert np.log(starts[1]).sum() < np.log(starts[0]).sum()
+    point = dict(zip(search.coordinates, search.first_point(), strict=True))
+    assert point["mixture"] == 1.0

@@ -9,8 +9,23 @@ from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
-from fusion_gym.policies.base import Requests, check_at_most, check_price, parameter, strongest
+from fusion_gym.policies.base import (
+    THRESHOLD,
+    PerSensor,
+    Requests,
+    check_at_most,
+    check_price,
+    not_negative_parameter,
+    parameter,
+    strongest,
+)
 from fusion_gym.policies.belief_rule import BeliefRule
+
+
+def check_threshold(name: str, value: PerSensor | None) -> None:
+    """Check numbers >= 0, or None."""
+    if value is not None:
+        not_negative_parameter(name, value)
 
 
 @dataclass
@@ -25,7 +40,8 @@ class ValueOfInformation(BeliefRule):
 
     Args:
         own: every sensor decides locally, by its memory and the broadcasts.
-        threshold: θ >= 0, in squared units of the states; 0.03 without a price.
+        threshold: θ >= 0, for all sensors or for each, in squared units of the states; 0.03 without
+            a price.
         price: price of a token in the reward's units, instead of the threshold.
         at_most: most requests in a step, by the highest value; None for no limit.
 
@@ -53,7 +69,7 @@ class ValueOfInformation(BeliefRule):
     filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
-    threshold: float | None = parameter(None, check_price)
+    threshold: PerSensor | None = parameter(None, check_threshold, THRESHOLD)
     price: float | None = parameter(None, check_price)
     at_most: int | None = parameter(None, check_at_most)
     stateless: ClassVar[bool] = True
@@ -68,7 +84,7 @@ class ValueOfInformation(BeliefRule):
         """Return the requests (sensors, N)."""
         value = self.beliefs(signals).value
         if self.price is None:
-            least: Any = 0.03 if self.threshold is None else self.threshold
+            least: Any = 0.03 if self.threshold is None else self.column("threshold", len(value))
         else:
             value = self.task.error_scale * value
             least = self.price * signals["token_cost"]
@@ -86,7 +102,7 @@ class EstimateDifference(BeliefRule):
 
     Args:
         own: every sensor decides locally, by its memory and the broadcasts.
-        threshold: θ >= 0, in the unit of the states, or without a unit.
+        threshold: θ >= 0, for all sensors or for each, in the unit of the states or without one.
         whitened: weigh by the inverse of the centre's claimed covariance.
         at_most: most requests in a step, by the highest value; None for no limit.
 
@@ -117,7 +133,7 @@ class EstimateDifference(BeliefRule):
     random_start=True token_rate=2 memory=True``.
     """
 
-    threshold: float = parameter(0.2, validation.number, at_least=0.0)
+    threshold: PerSensor = parameter(0.2, not_negative_parameter, THRESHOLD)
     whitened: bool = parameter(False, validation.boolean)
     at_most: int | None = parameter(1, check_at_most)
     stateless: ClassVar[bool] = True
@@ -126,7 +142,7 @@ class EstimateDifference(BeliefRule):
         """Return the requests (sensors, N)."""
         beliefs, age = self.beliefs(signals), signals["age"]
         squared = _whitened(beliefs) if self.whitened else beliefs.loss
-        due = squared >= self.threshold * self.threshold
+        due = squared >= self.column("threshold", len(age)) ** 2
         requests = namespace(due).broadcast_to(due, age.shape)
         if self.own or self.at_most is None:
             return requests.copy()
@@ -150,7 +166,7 @@ class KullbackLeibler(BeliefRule):
 
     Args:
         own: every sensor decides locally, by its memory and the broadcasts.
-        threshold: θ >= 0, in nats.
+        threshold: θ >= 0, for all sensors or for each, in nats.
         at_most: most requests in a step, by the highest divergence; None for no limit.
 
     Raises:
@@ -175,7 +191,7 @@ class KullbackLeibler(BeliefRule):
     filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
-    threshold: float = parameter(0.5, validation.number, at_least=0.0)
+    threshold: PerSensor = parameter(0.5, not_negative_parameter, THRESHOLD)
     at_most: int | None = parameter(None, check_at_most)
     stateless: ClassVar[bool] = True
 
@@ -183,7 +199,8 @@ class KullbackLeibler(BeliefRule):
         """Return the requests (sensors, N)."""
         beliefs = self.beliefs(signals)
         divergence = _divergence(beliefs.best if self.own else beliefs.sent, beliefs.silent)
-        return strongest(divergence, divergence >= self.threshold, self.at_most, signals["age"])
+        due = divergence >= self.column("threshold", len(divergence))
+        return strongest(divergence, due, self.at_most, signals["age"])
 
 
 def _divergence(estimate: Estimate, silent: Estimate) -> Array:

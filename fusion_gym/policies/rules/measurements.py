@@ -10,10 +10,12 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.namespace import namespace
 from fusion_gym.policies.base import (
+    THRESHOLD,
     ChanceRule,
     LocalRule,
     PerSensor,
     Requests,
+    SearchRange,
     check_at_most,
     each_number,
     not_negative_parameter,
@@ -55,7 +57,7 @@ class InnovationThreshold(LocalRule):
     random_start=True token_rate=2``.
     """
 
-    threshold: PerSensor = parameter(1.0, not_negative_parameter)
+    threshold: PerSensor = parameter(1.0, not_negative_parameter, THRESHOLD)
     whitened: bool = parameter(False, validation.boolean)
     at_most: int | None = parameter(None, check_at_most)
 
@@ -107,9 +109,9 @@ class AdaptiveInnovation(LocalRule):
     Example: ``adaptive_innovation`` in ``fusion_gym/CorrelatedTracking-v1``.
     """
 
-    threshold: PerSensor = parameter(0.6, not_negative_parameter)
+    threshold: PerSensor = parameter(0.6, not_negative_parameter, THRESHOLD)
     offset: PerSensor = parameter(0.2, not_negative_parameter)
-    sensitivity: PerSensor = parameter(0.9, not_negative_parameter)
+    sensitivity: PerSensor = parameter(0.9, not_negative_parameter, SearchRange(1e-4, 10.0))
 
     @property
     def knowledge(self) -> Knowledge:
@@ -189,14 +191,22 @@ class AdaptiveThreshold(LocalRule):
     Example: ``adaptive_threshold`` in ``fusion_gym/UnknownInput-v1``.
     """
 
-    rho_bar: PerSensor = 0.05
-    rho_initial: PerSensor = 0.01
-    adaptation: PerSensor = 0.01
-    scale: float = parameter(1.0, validation.number, at_least=0.0)
+    rho_bar: PerSensor = parameter(0.05, not_negative_parameter, SearchRange(1e-7, 1.0))
+    rho_initial: PerSensor = parameter(0.01, not_negative_parameter, SearchRange(1e-7, 1.0))
+    adaptation: PerSensor = parameter(0.01, each_number, THRESHOLD, above=0.0)
+    # A factor of the largest errors, because the paper's thresholds are at most 1.
+    scale: float = parameter(1.0, validation.number, SearchRange(1e4, 1e4), at_least=0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         validation.adaptive_thresholds(self.rho_bar, self.rho_initial, self.adaptation)
+
+    def admissible(self, values: dict[str, Array]) -> dict[str, Array]:
+        """Return parameters with ρ₀ at most ρ̄."""
+        if "rho_initial" in values:
+            limit = values.get("rho_bar", np.array(self.rho_bar, ndmin=1)[:, None])
+            values |= {"rho_initial": np.minimum(values["rho_initial"], limit)}
+        return super().admissible(values)
 
     @property
     def knowledge(self) -> Knowledge:
@@ -276,10 +286,10 @@ class DynamicEvent(LocalRule):
     random_start=True token_rate=2``.
     """
 
-    threshold: PerSensor = parameter(0.2, not_negative_parameter)
-    decay: PerSensor = parameter(0.1, not_negative_parameter)
-    divisor: PerSensor = parameter(5.0, each_number, above=0.0)
-    initial: PerSensor = parameter(1.5, not_negative_parameter)
+    threshold: PerSensor = parameter(0.2, not_negative_parameter, THRESHOLD)
+    decay: PerSensor = parameter(0.1, not_negative_parameter, SearchRange(1e-4, 10.0))
+    divisor: PerSensor = parameter(5.0, each_number, SearchRange(1e-2, 1e4), above=0.0)
+    initial: PerSensor = parameter(1.5, not_negative_parameter, THRESHOLD)
     scale: float = parameter(1.0, validation.number, at_least=0.0)
     knowledge: ClassVar[Knowledge] = "own_memory"
 
@@ -338,7 +348,7 @@ class SendOnDelta(LocalRule):
     random_start=True token_rate=2``.
     """
 
-    threshold: PerSensor = parameter(1.0, not_negative_parameter)
+    threshold: PerSensor = parameter(1.0, not_negative_parameter, THRESHOLD)
     knowledge: ClassVar[Knowledge] = "own"
     stateless: ClassVar[bool] = True
 
@@ -381,7 +391,7 @@ class ReportOnChange(LocalRule):
     ``fusion_gym/LinearFusion-v2 filter=hold``.
     """
 
-    reportable_change: PerSensor = parameter(1.0, not_negative_parameter)
+    reportable_change: PerSensor = parameter(1.0, not_negative_parameter, THRESHOLD)
     percent: bool = parameter(False, validation.boolean)
     knowledge: ClassVar[Knowledge] = "own"
     stateless: ClassVar[bool] = True
@@ -431,7 +441,7 @@ class StochasticEvent(ChanceRule, LocalRule):
     random_start=True token_rate=2``.
     """
 
-    weight: PerSensor = parameter(1.0, not_negative_parameter)
+    weight: PerSensor = parameter(1.0, not_negative_parameter, THRESHOLD)
     whitened: bool = parameter(False, validation.boolean)
     knowledge: ClassVar[Knowledge] = "own"
     stream: ClassVar[int] = 0x73746F6368  # independent of the noise of the same seed

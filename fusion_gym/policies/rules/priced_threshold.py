@@ -1,7 +1,7 @@
 """Transmit above a threshold that depends on price, tokens and age."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple, cast, get_args
+from typing import Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from fusion_gym.policies.base import (
     PerSensor,
     Requests,
     Rule,
+    SearchRange,
     check_price,
     each_number,
     not_negative_parameter,
@@ -24,23 +25,22 @@ from fusion_gym.policies.belief_rule import BeliefRule
 Score = Literal["value", "innovation", "variance"]
 
 
-class ThresholdNumbers(NamedTuple):
-    """The searched numbers of :class:`PricedThreshold`, (sensors, 1), or (…, N) for N runs."""
+def _power(
+    deviation: float, low: float = -3.0, high: float = 3.0, per_sensor: bool = False
+) -> SearchRange:
+    return SearchRange(low, high, per_sensor, logarithmic=False, deviation=deviation)
 
-    threshold: Array
-    price_exponent: Array
-    mixture: Array
-    token_exponent: Array
-    age_exponent: Array
-    margin: Array
-    margin_exponent: Array
+
+_SHARE = _power(0.1, 0.0, 1.0)
+_THRESHOLD = SearchRange(0.0, np.inf, deviation=0.15)
+_MARGIN = SearchRange(1.0, float(np.exp(4.0)), per_sensor=False, deviation=0.15)
 
 
 @dataclass
 class PricedThreshold(BeliefRule):
     r"""Request where a mixture of value and loss reaches a threshold that depends on the price.
 
-    A search (:mod:`fusion_gym.evaluation.rule_search`) sets its dozen numbers for all prices at
+    A search (:mod:`fusion_gym.evaluation.rule_search`) sets its dozen parameters for all prices at
     once, instead of one threshold for each price.
 
     Args:
@@ -90,15 +90,15 @@ class PricedThreshold(BeliefRule):
     """
 
     score: Score = parameter("value", validation.choice, options=get_args(Score))
-    threshold: PerSensor = parameter(0.03, not_negative_parameter)
-    price_exponent: PerSensor = parameter(1.0, each_number)
+    threshold: PerSensor = parameter(0.03, not_negative_parameter, _THRESHOLD)
+    price_exponent: PerSensor = parameter(1.0, each_number, _power(0.075, -1.0, 4.0, True))
     price: float | None = parameter(None, check_price)
     reference_price: float = parameter(1.0, validation.number, above=0.0)
-    mixture: float = parameter(0.0, validation.number, at_least=0.0, at_most=1.0)
-    token_exponent: float = parameter(0.0, validation.number)
-    age_exponent: float = parameter(0.0, validation.number)
-    margin: float = parameter(1.0, validation.number, at_least=1.0)
-    margin_exponent: float = parameter(0.0, validation.number)
+    mixture: float = parameter(0.0, validation.number, _SHARE, at_least=0.0, at_most=1.0)
+    token_exponent: float = parameter(0.0, validation.number, _power(0.15))
+    age_exponent: float = parameter(0.0, validation.number, _power(0.1))
+    margin: float = parameter(1.0, validation.number, _MARGIN, at_least=1.0)
+    margin_exponent: float = parameter(0.0, validation.number, _power(0.075))
     together: ClassVar[tuple[str, ...]] = ("margin", "margin_exponent")
     stateless: ClassVar[bool] = True
 
@@ -111,8 +111,6 @@ class PricedThreshold(BeliefRule):
             super().__post_init__()
         if self.score != "value":
             self.memory_owner = None
-        columns = (self.column(name, self.task.sensors) for name in ThresholdNumbers._fields)
-        self.numbers = ThresholdNumbers(*columns)
 
     @property
     def knowledge(self) -> Knowledge:
@@ -128,20 +126,21 @@ class PricedThreshold(BeliefRule):
     def log_ratio(self, signals: Signals) -> Array:
         """Return ln r - k ln max{1, s (p/p0)^μ} (sensors, N); a request is at least 0."""
         value, loss = self._scores(signals)
-        numbers, bucket = self.numbers, self.task.network.bucket
+        bucket, sensors = self.task.network.bucket, len(value)
         xp = namespace(value)
         age = xp.maximum(signals["age"], 0.0)
         price = signals["price"] if self.price is None else np.asarray(self.price)
         level = signals["energy" if bucket.per_sensor else "tokens"]
         tokens = (level + 1.0) / (bucket.capacity + 1.0)
         log_price = _log(price / self.reference_price)
-        least = _log(numbers.threshold) + numbers.price_exponent * log_price
+        least = _log(self.column("threshold", sensors))
+        least = least + self.column("price_exponent", sensors) * log_price
         if not bucket.unlimited:
-            least = least + numbers.token_exponent * xp.log(tokens)
-        least = least + numbers.age_exponent * xp.log((age + 1.0) / 6.0)
-        score = (1.0 - numbers.mixture) * _log(value) + numbers.mixture * _log(loss)
+            least = least + self.token_exponent * xp.log(tokens)
+        least = least + self.age_exponent * xp.log((age + 1.0) / 6.0)
+        score = (1.0 - self.mixture) * _log(value) + self.mixture * _log(loss)
         ratio = xp.where(value > 0.0, score - least, -np.inf)
-        margin = xp.maximum(_log(numbers.margin) + numbers.margin_exponent * log_price, 0.0)
+        margin = xp.maximum(_log(self.margin) + self.margin_exponent * log_price, 0.0)
         if xp is not np or margin.any():
             rank = xp.argsort(xp.lexsort((-age, -ratio), axis=0), axis=0)
             ratio = ratio - rank * margin
@@ -157,7 +156,7 @@ class PricedThreshold(BeliefRule):
         return beliefs.value, beliefs.loss
 
 
-def _log(values: Array) -> Array:
+def _log(values: Any) -> Array:
     """Return ln of values >= 0, finite at 0."""
     xp = namespace(values)
     result: Array = xp.log(xp.maximum(values, 1e-300))

@@ -9,16 +9,29 @@ from fusion_gym import validation
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.namespace import namespace
 from fusion_gym.policies.base import (
+    INTERVAL,
+    SHARED_THRESHOLD,
+    THRESHOLD,
     ChanceRule,
     PerSensor,
     Requests,
     Rule,
+    SearchRange,
     check_at_most,
     each_number,
+    not_negative_parameter,
     parameter,
     shape_of,
     strongest,
 )
+
+RATE = SearchRange(1e-3, 1.0)
+AGE = SearchRange(1.0, 1e3, per_sensor=False)
+
+
+def check_period(name: str, value: int) -> None:
+    """Check a number of steps >= 1."""
+    validation.integer(name, value, at_least=1, at_most=validation.MOST_PERIOD)
 
 
 @dataclass
@@ -96,7 +109,7 @@ class Periodic(Rule):
     random_start=True token_rate=2``.
     """
 
-    period: int = parameter(4, validation.integer, at_least=1, at_most=validation.MOST_PERIOD)
+    period: int = parameter(4, check_period, INTERVAL)
     staggered: bool = parameter(True, validation.boolean)
     knowledge: ClassVar[Knowledge] = "clock"
     stateless: ClassVar[bool] = True
@@ -132,7 +145,7 @@ class RoundRobin(Rule):
     random_start=True token_rate=2``.
     """
 
-    period: int = parameter(1, validation.integer, at_least=1, at_most=validation.MOST_PERIOD)
+    period: int = parameter(1, check_period, INTERVAL)
     knowledge: ClassVar[Knowledge] = "clock"
     stateless: ClassVar[bool] = True
 
@@ -163,7 +176,7 @@ class Random(ChanceRule):
     token_rate=2``.
     """
 
-    rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)
+    rate: PerSensor = parameter(0.2, each_number, RATE, at_least=0.0, at_most=1.0)
     knowledge: ClassVar[Knowledge] = "clock"
     stream: ClassVar[int] = 0x72616E646F6D  # independent of the noise of the same seed
 
@@ -208,7 +221,7 @@ class Paced(Rule):
     token_rate=2``.
     """
 
-    rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)
+    rate: PerSensor = parameter(0.2, each_number, RATE, at_least=0.0, at_most=1.0)
     staggered: bool = parameter(True, validation.boolean)
     knowledge: ClassVar[Knowledge] = "clock"
     stateless: ClassVar[bool] = True
@@ -251,7 +264,7 @@ class LocalVariance(Rule):
     Example: ``local_variance:m=0.9`` in ``fusion_gym/MarkovJumpTracking-v1``.
     """
 
-    m: PerSensor = parameter(0.9, each_number)
+    m: PerSensor = parameter(0.9, each_number, THRESHOLD)
     reference: float = parameter(0.0, validation.number, at_least=0.0)
     knowledge: ClassVar[Knowledge] = "centre"
     stateless: ClassVar[bool] = True
@@ -296,7 +309,7 @@ class CentreVariance(Rule):
     Example: ``centre_variance:threshold=2.5`` in ``fusion_gym/MarkovJumpTracking-v1``.
     """
 
-    threshold: float = parameter(1.6, validation.number, at_least=0.0)
+    threshold: float = parameter(1.6, validation.number, SHARED_THRESHOLD, at_least=0.0)
     at_most: int | None = parameter(None, check_at_most)
     knowledge: ClassVar[Knowledge] = "centre"
     stateless: ClassVar[bool] = True
@@ -336,7 +349,7 @@ class VarianceThreshold(Rule):
     random_start=True token_rate=2``.
     """
 
-    threshold: float = parameter(0.1, validation.number, at_least=0.0)
+    threshold: float = parameter(0.1, validation.number, SHARED_THRESHOLD, at_least=0.0)
     at_most: int | None = parameter(1, check_at_most)
     knowledge: ClassVar[Knowledge] = "centre"
     stateless: ClassVar[bool] = True
@@ -376,7 +389,7 @@ class MaximumAge(Rule):
     """
 
     at_most: int | None = parameter(1, check_at_most)
-    least: float = parameter(1.0, validation.number, at_least=1.0)
+    least: float = parameter(1.0, validation.number, AGE, at_least=1.0)
     knowledge: ClassVar[Knowledge] = "centre"
     stateless: ClassVar[bool] = True
 
@@ -394,7 +407,7 @@ class InformationGain(Rule):
     deliveries. It does not depend on the measurement.
 
     Args:
-        threshold: θ >= 0, the least relative reduction per token.
+        threshold: θ >= 0, the least relative reduction per token, for all sensors or for each.
         at_most: most requests in a step, by the highest gain; None for no limit.
 
     Equation:
@@ -415,7 +428,7 @@ class InformationGain(Rule):
     random_start=True token_rate=2``.
     """
 
-    threshold: float = parameter(0.05, validation.number, at_least=0.0)
+    threshold: PerSensor = parameter(0.05, not_negative_parameter, THRESHOLD)
     at_most: int | None = parameter(1, check_at_most)
     knowledge: ClassVar[Knowledge] = "centre"
     stateless: ClassVar[bool] = True
@@ -424,4 +437,5 @@ class InformationGain(Rule):
         """Return the requests (sensors, N)."""
         relative = signals["variance_reduction"] / signals["silent_variance"]
         gain = relative / signals["token_cost"]
-        return strongest(gain, gain >= self.threshold, self.at_most, signals["age"])
+        due = gain >= self.column("threshold", len(gain))
+        return strongest(gain, due, self.at_most, signals["age"])
