@@ -344,6 +344,7 @@ def _try(
     seed: int,
     loop: RuleLoop | None,
 ) -> list[ThresholdTrial]:
+    """Run the rules of several texts, each with its value, in one batch."""
     rules = [make_policy(text, task) for text in texts]
     error, tokens = _means(task, rules, episodes, seed, loop)
     error = np.nan_to_num(error, nan=_WORST, posinf=_WORST)

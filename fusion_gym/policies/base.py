@@ -163,7 +163,7 @@ def parameter(
     Args:
         default: the default value.
         check: function that refuses a value, such as a check of :mod:`fusion_gym.validation`.
-        search: where a search looks for it; None leaves it.
+        search: range of a search, a :class:`~fusion_gym.policies.base.SearchRange`; None for none.
         **limits: keywords of the check.
 
     Example:
