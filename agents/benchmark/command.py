@@ -7,7 +7,7 @@
 At five prices of every class it tunes the rules of the literature, searches one rule for all
 prices, trains agents, and compares all of them on the same test episodes. Into the results folder
 go the tables, a figure a setting and ``README.md``. With ``--policy`` your own policy is compared
-with the searched rule of a class; ``{price}`` in its text stands for the price.
+with the best rule of a class; ``{price}`` in its text stands for the price.
 
 Finished pieces of work stay in the work folder, under a hash of their inputs and of the code, and
 the same command goes on with the others. They hold pickles.
@@ -45,7 +45,7 @@ class Benchmark(Long):
     quick: bool = False
     """Run a small benchmark of three settings and one seed, in minutes."""
     policy: str | None = None
-    """Only compare this policy with the searched rule."""
+    """Only compare this policy with the best tuned rule."""
     class_name: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
     """Class of the policy."""
     results: Annotated[Path | None, OUTPUT_FOLDER] = None

@@ -7,24 +7,39 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from agents.benchmark import verdict
 from agents.benchmark.calibration import CalibrationJob, CalibrationResult, run_calibration
 from agents.benchmark.jobs import Runner
-from agents.benchmark.rules import SearchJob, SweepJob, SweepResult, rules_of, run_search, run_sweep
+from agents.benchmark.rules import (
+    SearchJob,
+    SweepJob,
+    SweepResult,
+    rules_of,
+    run_search,
+    run_sweep,
+    without_threshold,
+)
 from agents.benchmark.settings import Case, ClassName, Setting, Suite, knowledge_of
 from agents.benchmark.training import TrainingJob, run_training
 from agents.benchmark.verdict import mean_difference
+from fusion_gym import seeds
 from fusion_gym.core.knowledge import covers
-from fusion_gym.policies.registry import make_policy
+from fusion_gym.evaluation.rule_search import SearchResult
+from fusion_gym.policies.registry import make_policy, search_ranges
 from fusion_gym.validation import ConfigurationError
 
 TestResults = tuple[verdict.TestResult, ...]
 REFERENCE = "rule"
-CALIBRATED = {"agent": "learned", "other": "other_learned"}  # by the kind of the agent alone
+TRIGGERS = "printed", "trigger"
+SAVINGS = "printed", "thresholds", REFERENCE, "informed", "learned"
+FRESH = seeds.TUNING[10_000]  # first of the episodes that choose among tuned policies
+# By the kind of the agent alone.
+CALIBRATED = {"agent": "calibrated", "other": "other_calibrated"}
+LEARNED = {"agent": "learned", "other": "other_learned"}
 
 
 class TestRow(NamedTuple):
@@ -32,7 +47,7 @@ class TestRow(NamedTuple):
 
     setting: str
     name: str  # of the class
-    kind: str  # rule, threshold, trigger, agent, learned, other, …, optimum, the user's policy
+    kind: str  # rule, threshold, trigger, agent, calibrated, learned, …, the user's policy
     seed: int  # of the training
     share: float  # of the tokens of ``always`` that the best single threshold spends there
     price: float
@@ -45,7 +60,7 @@ class TestRow(NamedTuple):
 
 
 class PointRow(NamedTuple):
-    """The cost of a kind of policy at a price, relative to the searched rule's, minus 1."""
+    """The cost of a kind of policy at a price, over the best tuned rule's cost, minus 1."""
 
     setting: str
     name: str
@@ -71,18 +86,18 @@ class ClassRow(NamedTuple):
 
 
 class SavingRow(NamedTuple):
-    """The share of the own trigger's cost that a kind saves: a mean over prices and classes."""
+    """The share of the tuned trigger's cost that a kind saves in the class of its knowledge."""
 
     setting: str
+    name: str
     kind: str
-    classes: int
     saving: float
     low: float
     high: float
 
 
 class TrainingRow(NamedTuple):
-    """A training and its calibration: processor seconds, and costs over the rule's, minus 1."""
+    """A training: processor seconds, and costs over the best tuned rules', minus 1."""
 
     setting: str
     name: str
@@ -92,7 +107,7 @@ class TrainingRow(NamedTuple):
     timesteps: int
     seconds: float
     calibration_seconds: float
-    rule_points: int  # prices at which the calibration takes the rule alone
+    rule_points: int  # prices at which the learned policy is a rule
     agent: float
     learned: float
 
@@ -108,16 +123,32 @@ class CaseRow(NamedTuple):
     high: float
 
 
-class Trained(NamedTuple):
+@dataclass
+class Trained:
     """A training, its processor seconds, its calibration, and the file of the calibrated policy.
 
-    Where agents cannot be calibrated the policy is the agent.
+    Where agents cannot be calibrated the policy is the agent. ``rule_places`` are the places of
+    prices at which another rule than the searched one is the learned policy.
     """
 
     job: TrainingJob
     seconds: float
     calibration: CalibrationResult
     policy: Path
+    rule_places: tuple[int, ...] = ()
+
+    @property
+    def rule_points(self) -> int:
+        """Number of prices at which the learned policy is a rule."""
+        points = enumerate(self.calibration.points)
+        return sum(place in self.rule_places or point.mixture == 1.0 for place, point in points)
+
+    def learned(
+        self, outcomes: TestResults, reference: TestResults, places: Sequence[int]
+    ) -> TestResults:
+        """Return the results of the learned policy at some prices: its own or the reference's."""
+        every = zip(places, outcomes, reference, strict=True)
+        return tuple(rule if place in self.rule_places else own for place, own, rule in every)
 
 
 @dataclass
@@ -127,7 +158,8 @@ class Evidence:
     setting: Setting
     name: ClassName
     sweep: SweepResult
-    rule: str = ""
+    searches: dict[str, SearchResult] = field(default_factory=dict)
+    choice: dict[str, TestResults] = field(default_factory=dict)
     trainings: dict[str, list[Trained]] = field(default_factory=dict)
     tests: dict[str, list[TestResults]] = field(default_factory=dict)
     bounds: tuple[float, ...] = ()
@@ -140,7 +172,7 @@ class Evidence:
 
     def test(
         self, policies: Sequence[str], episodes: int, case: Case | None = None,
-        prices: Sequence[float] | None = None,
+        prices: Sequence[float] | None = None, seed: int = seeds.TEST.start,
     ) -> verdict.TestJob:  # fmt: skip
         """Return the test of one policy per price; the key of an agent is its file's content."""
         own_prices = tuple(self.prices if prices is None else prices)
@@ -153,13 +185,44 @@ class Evidence:
         if agent:
             content = hash_of(Path(texts[0].removeprefix("model:").rpartition(",price=")[0]))
         return verdict.TestJob(
-            self.setting, self.name, texts, own_prices, self.prices, episodes, content, agent, case
-        )
+            self.setting, self.name, texts, own_prices, self.prices, episodes, content, agent, case,
+            seed,
+        )  # fmt: skip
+
+    @property
+    def rule(self) -> str:
+        """Text of the searched rule."""
+        return self.searches[REFERENCE].policies[0]
 
     @property
     def priced_rule(self) -> str:
         """Text of the searched rule with ``{price}``."""
         return f"{self.rule},price={{price}}"
+
+    @property
+    def rules(self) -> dict[str, list[str]]:
+        """Tuned rules by kind, one at each price."""
+        result = {
+            REFERENCE: [self.priced_rule] * len(self.prices),
+            "threshold": [self.sweep.best(price).policy for price in self.prices],
+        }
+        result |= {k: [*r.policies] for k, r in self.searches.items() if k != REFERENCE}
+        tuned = {row.rule for row in self.sweep.tuned}
+        for kind, rule in self.setting.named_rules.items():
+            if rule.policy in tuned:
+                result[kind] = [self.sweep.best(price, rule.policy).policy for price in self.prices]
+        return result
+
+    @property
+    def references(self) -> list[str]:
+        """Kind of the tuned rule that costs least at each price, on tuning episodes."""
+        costs = {kind: [o.cost.mean() for o in results] for kind, results in self.choice.items()}
+        return [min(costs, key=lambda kind: costs[kind][k]) for k in range(len(self.prices))]
+
+    @property
+    def reference(self) -> TestResults:
+        """Results of the best tuned rule at each price."""
+        return tuple(self.tests[kind][0][k] for k, kind in enumerate(self.references))
 
     @property
     def best_seed(self) -> int:
@@ -168,9 +231,9 @@ class Evidence:
         return int(np.argmin(costs))
 
     @property
-    def best_policy(self) -> Path:
-        """File of the calibrated policy with that seed."""
-        return self.trainings["agent"][self.best_seed].policy
+    def best(self) -> Trained:
+        """Training with that seed."""
+        return self.trainings["agent"][self.best_seed]
 
 
 def hash_of(file: Path) -> str:
@@ -182,12 +245,20 @@ def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     """Run unfinished work, and return all classes."""
     classes = tune_thresholds(suite, runner)
     find_rules(suite, runner, classes)
+    choose_references(suite, runner, classes)
     train_agents(suite, runner, classes)
+    keep_references(suite, runner, classes)
     jobs = [verdict.BoundJob(item.setting, item.name, item.prices) for item in classes]
     for item, bounds in zip(classes, runner.run(verdict.run_bound, jobs, "bounds"), strict=True):
-        item.bounds = bounds
+        item.bounds = tuple(np.maximum.accumulate([0.0, *bounds])[1:].tolist())
     places = [(item, kind, texts) for item in classes for kind, texts in policies_of(item)]
     test_all(suite, runner, places)
+    for item in classes:
+        for kind, every in item.trainings.items():
+            pairs = zip(every, item.tests[CALIBRATED[kind]], strict=True)
+            own = [t.learned(o, item.reference, range(len(o))) for t, o in pairs]
+            item.tests[LEARNED[kind]] = own
+    test_informed(suite, runner, classes)
     test_cases(suite, runner, [item for item in classes if item.name == "scheduler"])
     return classes
 
@@ -209,13 +280,67 @@ def tune_thresholds(suite: Suite, runner: Runner, only: ClassName | None = None)
 
 
 def find_rules(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
-    """Search one rule for all prices of each class."""
-    generations, folder = suite.generations, runner.folder / "searches"
-    jobs = [
-        SearchJob(item.setting, item.name, item.prices, generations, folder) for item in classes
+    """Search one rule for all prices of each class, its trigger, and thresholds a sensor."""
+    places, jobs = list[tuple[Evidence, str]](), []
+    for item in classes:
+        own = item.setting, item.name, item.prices, suite.generations, runner.folder / "searches"
+        for kind, *rule in searched_rules(item):
+            places.append((item, kind))
+            jobs.append(SearchJob(*own, *rule))
+    results = runner.run(run_search, jobs, "searches")
+    for (item, kind), result in zip(places, results, strict=True):
+        item.searches[kind] = result
+
+
+def searched_rules(item: Evidence) -> Iterator[tuple[str, Any, tuple[str, ...], Case | None]]:
+    """Yield kind, text, parameters and case of each search of a class."""
+    yield REFERENCE, None, (), None
+    trigger = item.setting.trigger
+    if any(row.rule == trigger.policy for row in item.sweep.tuned):
+        yield "trigger", without_threshold(trigger.policy)[0], (), trigger.case
+    for policy in item.sweep.cheapest():
+        text, name = without_threshold(policy)
+        own = search_ranges(text).get(name)
+        if policy != trigger.policy and own is not None and own.per_sensor:
+            yield "thresholds", text, (name,), None
+            return
+
+
+def choose_references(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
+    """Compare the tuned rules of each class on fresh tuning episodes."""
+    places = [
+        (item, kind, texts)
+        for item in classes
+        for kind, texts in item.rules.items()
+        if kind != "trigger" or item.setting.trigger.case is None
     ]
-    for item, text in zip(classes, runner.run(run_search, jobs, "searches"), strict=True):
-        item.rule = text
+    episodes = suite.calibration_episodes[1]
+    jobs = [item.test(texts, episodes, seed=FRESH) for item, _, texts in places]
+    results = runner.run(verdict.run_test, jobs, "references")
+    for (item, kind, _), outcomes in zip(places, results, strict=True):
+        item.choice[kind] = outcomes
+
+
+def keep_references(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
+    """Keep another rule as the learned policy, unless the agent's is cheaper by two deviations.
+
+    The costs are those on the tuning episodes, and a deviation is their mean difference's.
+    """
+    places, jobs = list[tuple[Evidence, Trained]](), []
+    for item in classes:
+        if item.setting.calibrated and set(item.references) != {REFERENCE}:
+            for trained in (t for every in item.trainings.values() for t in every):
+                texts = [f"model:{trained.policy},price={{price}}"] * len(item.prices)
+                places.append((item, trained))
+                jobs.append(item.test(texts, suite.calibration_episodes[1], seed=FRESH))
+    results = runner.run(verdict.run_test, jobs, "choices of a rule")
+    for (item, trained), outcomes in zip(places, results, strict=True):
+        places_of_rules = []
+        for place, kind in enumerate(item.references):
+            gain = item.choice[kind][place].cost - outcomes[place].cost
+            if kind != REFERENCE and gain.mean() <= 2.0 * gain.std(ddof=1) / len(gain) ** 0.5:
+                places_of_rules.append(place)
+        trained.rule_places = tuple(places_of_rules)
 
 
 def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
@@ -255,7 +380,7 @@ def test_all(
 ) -> None:
     """Test policies of a class and kind, one at each price, on the test episodes."""
     jobs = [
-        item.test(texts, suite.episodes, item.setting.trigger.case if kind == "trigger" else None)
+        item.test(texts, suite.episodes, item.setting.trigger.case if kind in TRIGGERS else None)
         for item, kind, texts in places
     ]
     results = runner.run(verdict.run_test, jobs, "tests")
@@ -265,13 +390,10 @@ def test_all(
 
 def policies_of(item: Evidence) -> Iterator[tuple[str, list[str]]]:
     """Yield the kinds of policy of a class, each with one policy per price."""
+    yield from item.rules.items()
     count = len(item.prices)
-    yield REFERENCE, [item.priced_rule] * count
-    yield "threshold", [item.sweep.best(price).policy for price in item.prices]
-    tuned = {row.rule for row in item.sweep.tuned}
-    for kind, rule in {"trigger": item.setting.trigger, **item.setting.named_rules}.items():
-        if rule.policy in tuned:
-            yield kind, [item.sweep.best(price, rule.policy).policy for price in item.prices]
+    if "trigger" in item.searches and item.setting.printed:
+        yield "printed", [item.setting.printed] * count
     if item.setting.optimum is not None and item.name == "scheduler":
         yield "optimum", [item.setting.optimum] * count
     for kind, every in item.trainings.items():
@@ -280,20 +402,39 @@ def policies_of(item: Evidence) -> Iterator[tuple[str, list[str]]]:
             yield CALIBRATED[kind], [f"model:{trained.policy},price={{price}}"] * count
 
 
+def test_informed(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
+    """Test the scheduler's searched rule at the prices of the class of the trigger's knowledge."""
+    schedulers = {item.setting.name: item for item in classes if item.name == "scheduler"}
+    pairs = [
+        (item, schedulers[item.setting.name])
+        for item in classes
+        if item.name == item.setting.headline != "scheduler" and item.setting.name in schedulers
+    ]
+    jobs = [
+        other.test([other.priced_rule] * len(item.prices), suite.episodes, prices=item.prices)
+        for item, other in pairs
+    ]
+    results = runner.run(verdict.run_test, jobs, "rules of schedulers")
+    for (item, _), outcomes in zip(pairs, results, strict=True):
+        item.tests["informed"] = [outcomes]
+
+
 def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
-    """Test the rule, and the learned policy with the least cost in tuning, in perturbed cases."""
+    """Test the best rule, and the learned policy of the best seed, in perturbed cases."""
     places: list[tuple[Evidence, str]] = []
     jobs: list[verdict.TestJob] = []
+    middle = range(1, 4)  # places of prices
     for item in classes:
-        texts = item.priced_rule, f"model:{item.best_policy},price={{price}}"
-        prices = item.prices[1:4]  # the middle ones
+        prices, learned = item.prices[1:4], f"model:{item.best.policy},price={{price}}"
+        rules = [item.rules[item.references[k]][k] for k in middle]
         for case in (None, *suite.cases_of(item.setting)):
             places.append((item, "as assumed" if case is None else case.name))
-            for text in texts:
-                jobs.append(item.test([text] * 3, suite.case_episodes, case, prices))
+            for texts in (rules, [learned] * 3):
+                jobs.append(item.test(texts, suite.case_episodes, case, prices))
     results = runner.run(verdict.run_test, jobs, "perturbed cases")
     for place, (item, name) in enumerate(places):
-        item.cases[name] = results[2 * place], results[2 * place + 1]
+        rule, own = results[2 * place], results[2 * place + 1]
+        item.cases[name] = rule, item.best.learned(own, rule, middle)
 
 
 def check_policy(suite: Suite, text: str, name: ClassName) -> None:
@@ -309,13 +450,14 @@ def check_policy(suite: Suite, text: str, name: ClassName) -> None:
 
 
 def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) -> list[Evidence]:
-    """Test a policy in a class of every setting, together with the searched rule."""
+    """Test a policy in a class of every setting, together with the tuned rules."""
     classes = tune_thresholds(suite, runner, name)
     find_rules(suite, runner, classes)
+    choose_references(suite, runner, classes)
     places = [
-        (item, kind, [policy] * len(item.prices))
+        (item, kind, policies)
         for item in classes
-        for kind, policy in ((REFERENCE, item.priced_rule), ("policy", text))
+        for kind, policies in (item.rules | {"policy": [text] * len(item.prices)}).items()
     ]
     test_all(suite, runner, places)
     return classes
@@ -342,14 +484,12 @@ def policy_rows(suite: Suite, classes: Sequence[Evidence]) -> list[TestRow]:
 
 
 def point_rows(suite: Suite, classes: Sequence[Evidence]) -> list[PointRow]:
-    """Return the difference to the searched rule at every price."""
+    """Return the difference to the best tuned rule at every price."""
     places: list[tuple[Evidence, str, float, float]] = []
     results: list[verdict.Difference] = []
     for item in classes:
-        reference = item.tests[REFERENCE][0]
+        reference = item.reference
         for kind, every in item.tests.items():
-            if kind == REFERENCE:
-                continue
             for place, price in enumerate(item.prices):
                 costs = [outcomes[place].cost for outcomes in every]
                 places.append((item, kind, suite.shares[place], price))
@@ -362,18 +502,17 @@ def point_rows(suite: Suite, classes: Sequence[Evidence]) -> list[PointRow]:
 
 
 def class_rows(classes: Sequence[Evidence]) -> list[ClassRow]:
-    """Return the mean difference to the searched rule over a class's prices.
+    """Return the mean difference to the best tuned rules over a class's prices.
 
     The proven bound is a kind of its own, without an interval.
     """
     rows = []
     for item in classes:
-        (reference,), place = item.tests[REFERENCE], (item.setting.name, item.name)
+        reference, place = item.reference, (item.setting.name, item.name)
         for kind, every in item.tests.items():
-            if kind != REFERENCE:
-                d = mean_difference([(every, reference)])
-                median = float(np.median([mean_difference([([o], reference)]).mean for o in every]))
-                rows.append(ClassRow(*place, kind, d.mean, d.low, d.high, median))
+            d = mean_difference([(every, reference)])
+            median = float(np.median([mean_difference([([o], reference)]).mean for o in every]))
+            rows.append(ClassRow(*place, kind, d.mean, d.low, d.high, median))
         if item.bounds:
             costs = [float(outcome.cost.mean()) for outcome in reference]
             below = float(np.mean(np.divide(item.bounds, costs))) - 1.0
@@ -382,40 +521,43 @@ def class_rows(classes: Sequence[Evidence]) -> list[ClassRow]:
 
 
 def saving_rows(classes: Sequence[Evidence]) -> list[SavingRow]:
-    """Return the cost that each kind saves against the settings' own triggers.
+    """Return the cost that each kind saves against a setting's tuned trigger, a mean over prices.
 
-    It is the mean over prices and over the classes in which the trigger runs.
+    A setting counts in the class of its trigger's knowledge.
     """
     rows = []
-    for setting in dict.fromkeys(item.setting.name for item in classes):
-        own = [i for i in classes if i.setting.name == setting and "trigger" in i.tests]
-        for kind in ("threshold", REFERENCE, "learned"):
-            d = mean_difference([(item.tests[kind], item.tests["trigger"][0]) for item in own])
-            rows.append(SavingRow(setting, kind, len(own), -d.mean, -d.high, -d.low))
+    for item in classes:
+        if item.name == item.setting.headline and "trigger" in item.tests:
+            for kind in SAVINGS:
+                if kind in item.tests:
+                    own = verdict.saving(item.tests[kind], item.tests["trigger"][0])
+                    rows.append(SavingRow(item.setting.name, item.name, kind, *own))
+            if item.bounds:
+                costs = [float(outcome.cost.mean()) for outcome in item.tests["trigger"][0]]
+                most = 1.0 - float(np.mean(np.divide(item.bounds, costs)))
+                rows.append(SavingRow(item.setting.name, item.name, "bound", most, most, most))
     return rows
 
 
 def training_rows(classes: Sequence[Evidence]) -> list[TrainingRow]:
-    """Return a row for each training, with its costs over the searched rule's, minus 1."""
+    """Return a row for each training, with its costs over the best tuned rules', minus 1."""
     rows = []
     for item in classes:
-        (reference,) = item.tests[REFERENCE]
         for kind, every in item.trainings.items():
-            for seed, (job, seconds, result, _) in enumerate(every):
+            for seed, trained in enumerate(every):
                 agent, learned = (
-                    mean_difference([([item.tests[name][seed]], reference)]).mean
-                    for name in (kind, CALIBRATED[kind])
+                    mean_difference([([item.tests[name][seed]], item.reference)]).mean
+                    for name in (kind, LEARNED[kind])
                 )
-                rule_only = sum(point.mixture == 1.0 for point in result.points)
-                algorithm, training = job.experiment.algorithm.name, job.experiment.training
-                place = item.setting.name, item.name, kind, algorithm, seed
-                work = training.timesteps, seconds, result.seconds
-                rows.append(TrainingRow(*place, *work, rule_only, agent, learned))
+                experiment = trained.job.experiment
+                place = item.setting.name, item.name, kind, experiment.algorithm.name, seed
+                work = experiment.training.timesteps, trained.seconds, trained.calibration.seconds
+                rows.append(TrainingRow(*place, *work, trained.rule_points, agent, learned))
     return rows
 
 
 def case_rows(classes: Sequence[Evidence]) -> list[CaseRow]:
-    """Return the costs of every scheduler's rule and learned policy in the perturbed cases."""
+    """Return the costs of every scheduler's rules and learned policy in the perturbed cases."""
     rows = []
     for item in classes:
         for case, (rule, learned) in item.cases.items():

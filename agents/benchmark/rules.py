@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import collections
 import json
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,12 +21,14 @@ from fusion_gym.core.knowledge import covers
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.rule_search import (
     Generation,
+    RuleSearch,
+    SearchResult,
     ThresholdTrial,
     search_of_class,
     search_rule,
     try_thresholds,
 )
-from fusion_gym.output.files import replacing
+from fusion_gym.output.files import fingerprint, replacing
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -67,14 +72,24 @@ class SweepResult:
         )  # fmt: skip
         return min(own, key=lambda item: item.cost)
 
+    def cheapest(self) -> list[str]:
+        """Return the rules with the setting's options, the one that costs least at all first."""
+        costs: dict[str, float] = collections.defaultdict(float)
+        for row in self.tuned:
+            costs[row.rule] += math.log(row.cost) if row.case is None else math.inf
+        return sorted((rule for rule in costs if costs[rule] < math.inf), key=costs.__getitem__)
+
 
 @dataclass(frozen=True)
 class SearchJob(Job):
-    """The search of one rule for all prices of a class."""
+    """A search of one rule for all prices of a class, or of a rule's text at each price."""
 
     prices: tuple[float, ...]
     generations: int
     folder: Path = field(metadata={"key": False})
+    rule: str | None = None
+    parameters: tuple[str, ...] = ()
+    case: Case | None = None
     weight: ClassVar[float] = 110.0
 
 
@@ -114,6 +129,14 @@ def rules_of(
     return tuple(result)
 
 
+def without_threshold(policy: str) -> tuple[str, str]:
+    """Return the text of a rule without its threshold, and the threshold's name."""
+    name, _, text = policy.partition(":")
+    (own,) = re.findall(r"(\w+)=\{value\}", text)
+    others = [entry for entry in text.split(",") if "{value}" not in entry]
+    return (f"{name}:{','.join(others)}" if others else name), own
+
+
 def _try(task: Task, rule: ThresholdRule, values: Array, episodes: int) -> list[ThresholdTrial]:
     return try_thresholds(task, rule.policy, values.tolist(), episodes, seeds.TUNING.start)
 
@@ -129,11 +152,14 @@ def _finer(
     return min(trials, key=lambda trial: trial.cost(price))
 
 
-def run_search(job: SearchJob) -> str:
-    """Return the searched rule as text; the folder holds unfinished generations."""
-    task = job.setting.task(job.name)
-    search = search_of_class(job.name, task, job.prices, generations=job.generations)
-    state = job.folder / f"{job.setting.name}_{job.name}.json"
+def run_search(job: SearchJob) -> SearchResult:
+    """Return the searched rule; the folder holds unfinished generations."""
+    task, count = job.setting.task(job.name, job.case), job.generations
+    if job.rule is None:
+        search = search_of_class(job.name, task, job.prices, generations=count)
+    else:
+        search = RuleSearch(task, job.prices, job.rule, job.parameters, generations=count)
+    state = job.folder / f"{fingerprint(job.inputs)}.json"
     state.parent.mkdir(parents=True, exist_ok=True)
     content = json.loads(state.read_text()) if state.exists() else []
     earlier = [Generation(**item) for item in content]
@@ -144,4 +170,4 @@ def run_search(job: SearchJob) -> str:
         with replacing(state) as partial:
             partial.write_text(json.dumps([asdict(item) for item in generations]))
 
-    return search_rule(search, earlier, store).policies[0]
+    return search_rule(search, earlier, store)

@@ -46,6 +46,7 @@ class ThresholdRule(Strict):
 class Setting(Strict):
     """An environment with options, its own trigger, and the length of its trainings.
 
+    ``printed`` is the trigger with the paper's parameters, ``headline`` the class of its knowledge.
     ``named_rules`` are tested by their titles like the trigger. ``prices`` has a list
     for each class, ``seconds`` about the length of a training in a class. ``optimum`` is a policy
     with ``{price}``.
@@ -57,6 +58,8 @@ class Setting(Strict):
     options: Options
     trigger: ThresholdRule
     trigger_title: str
+    printed: str | None = None
+    headline: ClassName
     named_rules: dict[str, ThresholdRule] = pydantic.Field(default_factory=dict)
     classes: tuple[ClassName, ...] = CLASSES
     prices: dict[ClassName, list[Rate]]

@@ -22,11 +22,12 @@ from fusion_gym.validation import ConfigurationError
 
 LEVEL = 0.95
 FALSE_DISCOVERIES = 0.05
+RESAMPLES = 2000  # of the bootstrap
 
 
 @dataclass(frozen=True)
 class TestJob(Job):
-    """A policy at each price, on the test episodes.
+    """A policy at each price, on the test episodes or others from ``seed``.
 
     ``content`` is the text of all policies, or the hash of an agent's file. An agent runs in the
     class's environment for agents, whose price range is ``class_prices``; a rule runs in the
@@ -41,6 +42,7 @@ class TestJob(Job):
     content: str
     agent: bool = False
     case: Case | None = None
+    seed: int = seeds.TEST.start
     weight: ClassVar[float] = 8.0
 
     def task(self) -> Task:
@@ -73,7 +75,7 @@ def run_test(job: TestJob) -> tuple[TestResult, ...]:
     """Return the result of each policy at its price."""
     task, result = job.task(), []
     policies = [make_policy(text, task) for text in job.policies]
-    every = run_several(task, policies, job.episodes, seeds.TEST.start)
+    every = run_several(task, policies, job.episodes, job.seed)
     for text, price, results in zip(job.policies, job.prices, every, strict=True):
         rate, mse = float(results.rate.mean()), float(results.mse.mean())
         result.append(TestResult(text, price, results.error_cost, results.tokens, mse, rate))
@@ -130,6 +132,25 @@ def _difference(blocks: Sequence[Array]) -> Difference:
     reach = float(stats.t.ppf(0.5 + LEVEL / 2.0, degrees)) * variance**0.5
     p = 2.0 * float(stats.t.sf(abs(mean) / variance**0.5, degrees))
     return Difference(mean, mean - reach, mean + reach, p)
+
+
+def saving(
+    trained: Sequence[Sequence[TestResult]], trigger: Sequence[TestResult]
+) -> tuple[float, float, float]:
+    """Return the share of a trigger's cost that policies save, a mean over prices, with ends.
+
+    The interval is a bootstrap over seeds, and over the episodes of both policies together.
+    """
+    costs = np.array([[result.cost for result in outcomes] for outcomes in trained])
+    base = np.array([result.cost for result in trigger])
+    rng, (seeds, _, episodes) = np.random.default_rng(0), costs.shape
+    rows, columns = (
+        rng.multinomial(size, np.full(size, 1.0 / size), RESAMPLES) / size
+        for size in (seeds, episodes)
+    )
+    drawn = np.einsum("ds,spe,de->dp", rows, costs, columns, optimize=True) / (columns @ base.T)
+    low, high = np.quantile(1.0 - drawn.mean(1), [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0]).tolist()
+    return 1.0 - float((costs.mean((0, 2)) / base.mean(1)).mean()), low, high
 
 
 def discoveries(p_values: Sequence[float]) -> list[bool]:

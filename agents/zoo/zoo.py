@@ -1,8 +1,8 @@
-"""Put one learned policy of each class of the benchmark into the model zoo, with its card.
+"""Put one calibrated agent of each class of the benchmark into the model zoo, with its card.
 
     python -m agents.zoo --work runs/benchmark
 
-A learned policy is an agent that is calibrated with the searched rule. Its training seed has the
+The policy is an agent that is calibrated with the searched rule. Its training seed has the
 least cost on the tuning episodes, so the test figures are unbiased. The command first runs the
 benchmark's unfinished work. It removes policies of other names.
 """
@@ -27,7 +27,7 @@ from fusion_gym.output.progress import writing
 
 @dataclass(frozen=True)
 class Zoo(Long):
-    """Put one learned policy of each class of the benchmark into the model zoo, with its card."""
+    """Put one calibrated agent of each class of the benchmark into the model zoo, with its card."""
 
     program = "python -m agents.zoo"
 
@@ -47,7 +47,7 @@ class Zoo(Long):
             f"{item.setting.name}_{item.name}": item
             for item in gather(suite, Runner(work, Pool(self.workers)))
         }
-        models = {name: item.best_policy.read_bytes() for name, item in classes.items()}
+        models = {name: item.best.policy.read_bytes() for name, item in classes.items()}
         writing((f"{len(models)} agents with their cards", self.zoo))
         for name, item in classes.items():
             write(self.zoo / f"{name}.json", agent_card(suite, item, models[name]))
@@ -61,7 +61,7 @@ class Zoo(Long):
 def agent_card(suite: Suite, item: Evidence, model: bytes) -> Plain:
     """Return the content of an agent's JSON."""
     seed = item.best_seed
-    experiment = item.trainings["agent"][seed].job.experiment
+    experiment = item.best.job.experiment
     options = dict(experiment.environment.options)
     for name in ("cost_weight", "price_range"):
         options.pop(name)
@@ -85,7 +85,7 @@ def agent_card(suite: Suite, item: Evidence, model: bytes) -> Plain:
                     "mse": outcome.mse,
                     "rate": outcome.rate,
                 }
-                for outcome in item.tests["learned"][seed]
+                for outcome in item.tests["calibrated"][seed]
             ],
         },
     }

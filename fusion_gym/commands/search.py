@@ -60,14 +60,18 @@ class Search(EnvironmentOptions, Long):
         env_id, options = self.environment()
         task = make_task(env_id, **options)
         prices = token_prices(env_id, options, task, self.prices)
-        if self.rule is not None and self.class_name is not None:
-            raise forbidden("class", self.class_name, "leave it out", "with --rule")
         if self.rule is None:
             search = rule_search.search_of_class(
                 self.class_name or "scheduler", task, prices, generations=self.generations
             )
         else:
-            search = rule_search.RuleSearch(task, prices, self.rule, generations=self.generations)
+            own = task, prices, self.rule
+            try:
+                search = rule_search.RuleSearch(*own, generations=self.generations)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"rule = {self.rule!r} is not allowed: {error}") from None
+            if self.class_name is not None:
+                raise forbidden("class", self.class_name, "leave it out", "with --rule")
         chosen = self.class_name or ("scheduler" if self.rule is None else None)
         inputs: Plain = {"env": env_id, "class": chosen, "rule": self.rule}
         inputs |= {"prices": search.prices, "generations": self.generations}

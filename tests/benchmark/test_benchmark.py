@@ -1,5 +1,6 @@
 """The benchmark: prices, searched rules, agents, verdict, pages and the zoo made from it."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -17,7 +18,7 @@ from scipy import stats
 import fusion_gym
 from agents import cache
 from agents.benchmark import evidence, rules, settings, training, verdict
-from agents.benchmark.report import draw_class, headline_text, mean_text
+from agents.benchmark.report import draw_class, mean_text
 from agents.benchmark.settings import CLASSES, knowledge_of, load_suite
 from agents.benchmark.verdict import cost_difference, discoveries, mean_difference
 from fusion_gym.core.knowledge import covers
@@ -84,25 +85,35 @@ def test_from_prices_to_pages_and_zoo(
     for row in trainings:
         kind = "learned" if row.algorithm == "counterfactual_ppo" else "other_learned"
         own = [p for p in policies if (p.name, p.kind, p.seed) == (row.name, kind, row.seed)]
-        rule = [p.cost for p in policies if (p.name, p.kind) == (row.name, "rule")]
-        ratios = np.divide([p.cost for p in own], rule)
+        every = {
+            kind: np.array([p.cost for p in policies if (p.name, p.kind) == (row.name, kind)])
+            for kind in ("rule", "threshold", "thresholds", "trigger")
+        }
+        excess = [p.difference for p in points if (p.name, p.kind) == (row.name, "rule")]
+        best = every["rule"] / (1.0 + np.array(excess))
+        assert np.isclose(best, [*filter(len, every.values())], rtol=1e-4).any(axis=0).all()
+        ratios = np.divide([p.cost for p in own], best)
         assert row.learned == pytest.approx(ratios.mean() - 1.0, abs=1e-4)
-        # Where the calibration takes the rule alone, both policies are the same.
-        assert 0 <= row.rule_points <= np.isclose(ratios, 1.0, atol=1e-5).sum()
+        # Where a rule remains alone, both policies are the same.
+        assert 0 <= row.rule_points <= np.isclose(ratios, 1.0, atol=1e-4).sum()
     savings = {row.kind: row for row in read_rows(folder, evidence.SavingRow)}
     costs = {
         (kind, name): np.array([p.cost for p in policies if (p.kind, p.name) == (kind, name)])
         for kind in ("rule", "trigger")
         for name in CLASSES
     }
-    shares = [1.0 - costs["rule", name] / costs["trigger", name] for name in ("local", "scheduler")]
-    assert savings["rule"].saving == pytest.approx(np.mean(shares), abs=1e-4)
-    assert savings["rule"].classes == 2
+    expected = 1.0 - np.mean(costs["rule", "local"] / costs["trigger", "local"])
+    assert savings["rule"].saving == pytest.approx(expected, abs=1e-4)
+    assert savings["rule"].low <= savings["rule"].saving <= savings["rule"].high
+    assert {row.name for row in savings.values()} == {"local"}
+    assert {*savings} == {"thresholds", "rule", "informed", "learned"}
     cases = read_rows(folder, evidence.CaseRow)
     assert [row.case for row in cases] == ["as assumed", "half the tokens"]
     assert cases[0].rule == 0.0
     page = (folder / "README.md").read_text()
-    assert headline_text(load_suite().settings, list(savings.values())) in page
+    assert re.search(
+        r"\| Remote estimation +\| Whittle's index \(literature\), local sensors +\|", page
+    )
     assert (folder / "remote_estimation.png").stat().st_size > 20_000
     assert "remote_estimation" in printed
     # Finished pieces are not done again.
@@ -112,7 +123,7 @@ def test_from_prices_to_pages_and_zoo(
     place = ["--work", str(tmp_path / "work"), "--zoo", str(tmp_path / "zoo"), "--workers", "1"]
     succeed("zoo", place)
     card = json.loads((tmp_path / "zoo" / "remote_estimation_local.json").read_text())
-    rows = [row for row in policies if (row.name, row.kind) == ("local", "learned")]
+    rows = [row for row in policies if (row.name, row.kind) == ("local", "calibrated")]
     costs = {f"{row.cost:.4g}" for row in rows}
     assert {f"{point['cost']:.4g}" for point in card["test"]["points"]} <= costs
 
@@ -218,7 +229,7 @@ def test_points_without_tokens_have_a_tick_and_no_line() -> None:
         for price, error, tokens in ((0.1, 0.2, 2.0), (1.0, 0.5, 0.02), (9.0, 0.9, 0.0))
     ]
     _, panel = plt.subplots()
-    assert list(draw_class(panel, rows)) == ["own trigger"]
+    assert list(draw_class(panel, rows)) == ["tuned trigger"]
     line, alone, _ = panel.get_lines()
     assert sorted(line.get_xdata()) == [0.02, 2.0]
     assert (list(alone.get_ydata()), alone.get_linestyle()) == ([0.9], "None")
@@ -233,6 +244,39 @@ def test_discoveries_are_those_of_the_procedure() -> None:
     assert discoveries([0.001, 0.02, 0.04, 0.9]) == [True, True, False, False]
     assert discoveries([0.04, 0.04]) == [True, True]
     assert discoveries([]) == []
+
+
+def test_a_saving_has_the_interval_of_a_ratio_of_means() -> None:
+    """By the delta method for one training, and wider by the spread of three trainings."""
+    rng = np.random.default_rng(0)
+    common = rng.gamma(9.0, 1.0, (2, 4000))
+
+    def results(costs: Any) -> list[verdict.TestResult]:
+        zero = np.zeros(costs.shape[-1])
+        return [verdict.TestResult("", 1.0, cost, zero, 0.0, 0.0) for cost in costs]
+
+    policy = 0.7 * common + rng.normal(0.0, 2.0, common.shape)
+    mean, low, high = verdict.saving([results(policy)], results(common))
+    ratio = policy.mean(1) / common.mean(1)
+    assert mean == pytest.approx(1.0 - ratio.mean())
+    errors = (policy - ratio[:, None] * common) / common.mean(1)[:, None]
+    reach = 1.96 * errors.mean(0).std() / 4000**0.5
+    assert (mean - low, high - mean) == pytest.approx((reach, reach), rel=0.15)
+    several = [results(policy + shift) for shift in (-1.0, 0.0, 1.0)]
+    wide = verdict.saving(several, results(common))
+    assert wide[0] == pytest.approx(mean)
+    assert wide[2] - wide[1] > 3.0 * (high - low)
+
+
+def test_a_rule_is_searched_without_its_threshold() -> None:
+    assert rules.without_threshold("paced:rate={value}") == ("paced", "rate")
+    text = "innovation_threshold:threshold={value},at_most=1"
+    assert rules.without_threshold(text) == ("innovation_threshold:at_most=1", "threshold")
+    row = rules.TunedRule("a", 1.0, "a:b=1", 2.0, None)
+    other = dataclasses.replace(row, rule="b", cost=1.0)
+    foreign = dataclasses.replace(row, rule="c", cost=0.5, case=settings.Case(name="devices"))
+    sweep = rules.SweepResult((row, other, foreign))
+    assert sweep.cheapest() == ["b", "a"]
 
 
 def test_another_rule_or_price_trains_nothing_again() -> None:

@@ -2,7 +2,7 @@
 
 import csv
 from pathlib import Path
-from typing import TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import pydantic
 
@@ -17,3 +17,9 @@ def read_rows(folder: Path, kind: type[Row]) -> list[Row]:
     adapter = pydantic.TypeAdapter(list[kind])  # type: ignore[valid-type]
     with (folder / f"{KINDS[kind]}.csv").open(newline="") as file:
         return adapter.validate_python(list(csv.DictReader(file)))
+
+
+def read_results(folder: Path) -> Results:
+    """Return all rows of the benchmark."""
+    rows: list[Any] = [read_rows(folder, kind) for kind in KINDS]
+    return Results(*rows)

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from benchmark_rows import read_rows
+from benchmark_rows import read_results
 from markdown_it import MarkdownIt
 from page_blocks import LANGUAGES
 from paths import ROOT
 
 import fusion_gym
-from agents.benchmark.evidence import SavingRow
 from agents.benchmark.report import headline_text
 from agents.benchmark.settings import load_suite
 from docs.tables import PART, TABLES, written
@@ -46,7 +45,7 @@ QUESTIONS = {
     "VecNormalize": "docs/algorithms.md#vecnormalize",
     "a plant of one's own": "docs/your_system.md#",
     "a log of one's own": "docs/tutorials/your_log.md#",
-    "what a learned policy saves": "results/README.md#against-the-searched-rule",
+    "what a learned policy saves": "results/README.md#against-the-best-rule",
     "a paper's figures": "docs/reproduction/README.md#",
 }
 
@@ -81,8 +80,7 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
 
 
 def test_the_readme_says_what_the_results_say() -> None:
-    rows = read_rows(ROOT / "results", SavingRow)
-    assert headline_text(load_suite().settings, rows) in README
+    assert headline_text(load_suite().settings, read_results(ROOT / "results")) in README
 
 
 def test_one_version_is_in_code_results_citations_and_changelog() -> None:
