@@ -3,7 +3,7 @@
 Source: adaptive_innovation, Section 6.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -13,16 +13,14 @@ from scipy.stats import norm
 
 import fusion_gym
 from agents.papers import adaptive_innovation_runs as runs
-from agents.papers import checks
 from agents.papers.adaptive_innovation_runs import SENSORS, STEPS, Lane
 from agents.papers.drawing import legend, set_ticks, stack
 from agents.papers.numbers import Number, grid
-from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
+from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.output import palette
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
-from fusion_gym.validation import boolean, number
 
 STATES = ("position", "velocity", "acceleration")
 UNITS = ("m", "m/s", "m/s²")
@@ -65,9 +63,7 @@ def _replaced(**changes: Any) -> runs.RequestFunction:
     return lambda signals, event: rule(signals)
 
 
-def simulate_rates(
-    episodes: int, seed: int, settings: Settings, lanes: Sequence[str] = TRIGGERS
-) -> Data:
+def simulate_rates(episodes: int, seed: int, settings: Settings) -> Data:
     """Return rates (lanes, sensors, E); innovations and requests of the trigger, the first lane.
 
     ``changes`` (2, E): shares of the steps after a request, then after silence, in which a
@@ -77,13 +73,13 @@ def simulate_rates(
         OURS: None, PRINTED_SIGN: _replaced(sign=1.0), FIXED: _replaced(sensitivity=0.0),
         TIMED: _replaced(threshold=0.0),
     }  # fmt: skip
-    every = [_lane(settings, rule=rules[name]) for name in lanes]
-    requested = np.empty((STEPS, len(SENSORS), len(lanes) * episodes), dtype=np.bool_)
+    every = [_lane(settings, rule=rules[name]) for name in TRIGGERS]
+    requested = np.empty((STEPS, len(SENSORS), len(every) * episodes), dtype=np.bool_)
     innovation = np.empty((STEPS, len(SENSORS), episodes))
     for step in runs.steps(every, episodes, seed, settings, fusion="sici"):
         requested[step.number] = step.outcome.requested
         innovation[step.number] = step.innovation[:, :episodes]
-    rates = requested.mean(0).reshape(len(SENSORS), len(lanes), episodes).swapaxes(0, 1)
+    rates = requested.mean(0).reshape(len(SENSORS), len(every), episodes).swapaxes(0, 1)
     task = fusion_gym.make_task(CorrelatedTrackingOptions(**settings["options"]))
     rule = runs.make_trigger(settings, task)
     first, last = requested[..., :episodes], np.zeros((len(SENSORS), episodes))
@@ -95,7 +91,7 @@ def simulate_rates(
     sums = [((moved & where).sum((0, 1)), where.sum((0, 1))) for where in (after, ~after)]
     changes = [changed / np.maximum(count, 1) for changed, count in sums]
     return {
-        "lanes": list(lanes), "rates": rates, "changes": np.array(changes),
+        "lanes": list(TRIGGERS), "rates": rates, "changes": np.array(changes),
         "levels": levels[..., 0],
         "ceiling": float(rule.threshold_after(np.zeros((len(SENSORS), 1))).max()),
         "requested": first[..., 0].astype(np.int64),
@@ -139,36 +135,26 @@ def _of_other_episodes(episodes: int) -> runs.RequestFunction:
     return request
 
 
-def simulate_fusion(
-    episodes: int,
-    seed: int,
-    settings: Settings,
-    lanes: Sequence[str] = ("bounds", "scales", "others"),
-    fusions: Sequence[str] = FUSIONS,
-) -> Data:
+def simulate_fusion(episodes: int, seed: int, settings: Settings) -> Data:
     """Return the data of Figures 4 to 9 and their claims, by fusion rule.
 
-    See :class:`ErrorRecord`. ``lanes`` are groups: the trigger at the bounds of the variances, at
-    every noise scale or at the first, and two other policies at the bounds.
+    See :class:`ErrorRecord`. The lanes are the trigger at the bounds of the variances and at every
+    noise scale, and two other policies at the bounds.
     """
     lane = partial(_lane, settings)
-    scaled = {f"scale {scale}": lane(scale) for scale in settings["scales"]}
-    groups = {
-        "bounds": {AT_BOUND: lane()}, "scales": scaled, "first": dict([next(iter(scaled.items()))]),
-        "others": {
-            OTHERS: lane(rule=_of_other_episodes(episodes)),
-            ALWAYS: lane(rule=lambda signals, event: np.ones_like(event)),
-        },
-    }  # fmt: skip
-    selected = {name: lane for group in lanes for name, lane in groups[group].items()}
+    lanes = {AT_BOUND: lane()} | {f"scale {scale}": lane(scale) for scale in settings["scales"]}
+    lanes |= {
+        OTHERS: lane(rule=_of_other_episodes(episodes)),
+        ALWAYS: lane(rule=lambda signals, event: np.ones_like(event)),
+    }
     data: Data = {
-        "lanes": list(selected), "scales": list(settings["scales"]),
+        "lanes": list(lanes), "scales": list(settings["scales"]),
         "reached": all(ratio == 1.0 for ratio in lane().ratios),
     }  # fmt: skip
-    for fusion in fusions:
-        record = runs.ErrorRecord(len(selected), episodes, with_nodes=fusion == FUSIONS[0])
+    for fusion in FUSIONS:
+        record = runs.ErrorRecord(len(lanes), episodes, with_nodes=fusion == FUSIONS[0])
         options = {"fusion": fusion, "track_actual": True}
-        for step in runs.steps(selected.values(), episodes, seed, settings, **options):
+        for step in runs.steps(lanes.values(), episodes, seed, settings, **options):
             record.add(step)
         data |= {f"{fusion}_{name}": value for name, value in record.arrays().items()}
     return data
@@ -385,14 +371,6 @@ def _draw_ellipses(figure: Any, data: Data) -> None:
     figure.legend(handles, labels, loc="outside upper center", ncols=7, columnspacing=0.8)
 
 
-def _figure(draw: Any, size: tuple[float, float], lanes: str, *fusions: str) -> PaperFigure:
-    without = ("scales",) if lanes == "bounds" else ()
-    restriction = {"lanes": [lanes], "fusions": fusions or FUSIONS}
-    return PaperFigure("fusion", draw, size, restriction, without)
-
-
-_RATIO = partial(number, above=0.0, at_most=1.0)
-
 PAPER = Paper(
     "adaptive_innovation",
     (
@@ -400,25 +378,17 @@ PAPER = Paper(
         Piece("fusion", simulate_fusion, _summarise_fusion, 100.0, 200),
     ),
     {
-        "figure_3": PaperFigure(
-            "rates", _draw_thresholds, (7.2, 5.6), {"lanes": [OURS]}, ("scales",)
-        ),
-        "figure_4": _figure(_draw_tracking, (7.2, 6.4), "bounds"),
-        "figure_5": _figure(_draw_traces, (7.2, 6.0), "bounds"),
-        "figure_6": _figure(_draw_comparison, (7.2, 3.6), "bounds"),
-        "figure_7": _figure(partial(_draw_errors, fusion="sci"), (7.2, 5.6), "scales", "sci"),
-        "figure_8": _figure(partial(_draw_errors, fusion="sici"), (7.2, 5.6), "scales", "sici"),
-        "figure_9": _figure(_draw_ellipses, (7.6, 6.6), "first"),
+        "figure_3": PaperFigure("rates", _draw_thresholds, (7.2, 5.6)),
+        "figure_4": PaperFigure("fusion", _draw_tracking, (7.2, 6.4)),
+        "figure_5": PaperFigure("fusion", _draw_traces, (7.2, 6.0)),
+        "figure_6": PaperFigure("fusion", _draw_comparison, (7.2, 3.6)),
+        "figure_7": PaperFigure("fusion", partial(_draw_errors, fusion="sci"), (7.2, 5.6)),
+        "figure_8": PaperFigure("fusion", partial(_draw_errors, fusion="sici"), (7.2, 5.6)),
+        "figure_9": PaperFigure("fusion", _draw_ellipses, (7.6, 6.6)),
     },
-    "fusion_gym/CorrelatedTracking-v1",
     {
-        "scales": Parameter((0.8, 0.6, 0.4), checks.numbers_within(above=0.0, at_most=1.0)),
-        "policy": Parameter(TRIGGER, checks.policy_of(TRIGGER)),
-        "process_ratio": Parameter(1.0, _RATIO), "own_ratio": Parameter(1.0, _RATIO),
-        "start_ratio": Parameter(None, checks.number_or_none(at_least=0.0, at_most=1.0)),
-        "power": Parameter(1.0, partial(number, above=0.0, at_most=2.0)),
-        "same_step": Parameter(False, boolean),
+        "scales": (0.8, 0.6, 0.4), "policy": TRIGGER, "process_ratio": 1.0, "own_ratio": 1.0,
+        "start_ratio": None, "power": 1.0, "same_step": False,
     },
-    ("process_variance", "trigger_threshold", "trigger_offset", "trigger_sensitivity"),
     READINGS,
 )  # fmt: skip

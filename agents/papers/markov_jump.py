@@ -14,18 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
-from agents.papers import checks
 from agents.papers.drawing import legend, stack
 from agents.papers.markov_jump_covariances import covariances, fused_traces, iterated_gap
 from agents.papers.numbers import Number, below, grid
-from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
+from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
 from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.output import palette
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
-from fusion_gym.validation import boolean
 
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")
@@ -86,8 +84,7 @@ def trigger(m: float, literal: bool = False) -> str:
 
 def _lanes(settings: Settings) -> dict[str, str]:
     """Return the trigger at every threshold and the other policies, by their labels."""
-    lanes = {f"m = {m:g}": trigger(m) for m in settings["m"]}
-    return lanes | {policy: policy for policy in settings["policies"]}
+    return {f"m = {m:g}": trigger(m) for m in settings["m"]}
 
 
 class Run(NamedTuple):
@@ -456,12 +453,6 @@ PAPER = Paper(
         "figure_4": PaperFigure("tracking", _draw_errors, (7.2, 5.0)),
         "figure_5": PaperFigure("schedule", _draw_traces, (7.2, 3.9)),
     },
-    "fusion_gym/MarkovJumpTracking-v1",
-    {
-        "m": Parameter((0.0, 0.9, 1.3, 1.5), checks.numbers_within(at_least=0.0)),
-        "policies": Parameter((), checks.policy_list), "augmented": Parameter(False, boolean),
-        "reference": Parameter(None, checks.number_or_none(at_least=0.0)),
-    },
-    ("horizon", "fusion"),
+    {"m": (0.0, 0.9, 1.3, 1.5), "augmented": False, "reference": None},
     READINGS,
 )  # fmt: skip

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 import fusion_gym
-from agents.papers import checks
 from agents.papers import round_robin_tobit_runs as runs
 from agents.papers import round_robin_tobit_theorems as theorems
 from agents.papers.drawing import legend, stack
 from agents.papers.numbers import Number, above_zero
-from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
+from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -178,9 +177,7 @@ def _summarise_nodes(data: Data) -> Data:
 # --- censoring intervals and noise variances ------------------------------------------------------
 
 
-def simulate_tables(
-    episodes: int, seed: int, settings: Settings, tables: Sequence[str] = ("table_2", "table_3")
-) -> Data:
+def simulate_tables(episodes: int, seed: int, settings: Settings) -> Data:
     """Return the rows of both tables, by the paper's filter and by the assumed-density filter.
 
     Both begin with the first interval and the first variance.
@@ -211,7 +208,7 @@ def simulate_tables(
         }  # fmt: skip
 
     data: Data = {
-        name: [row(*each) for each in pairwise([pairs[name][0], *pairs[name]])] for name in tables
+        name: [row(*each) for each in pairwise([own[0], *own])] for name, own in pairs.items()
     }
     task = _oscillator(settings)
     never = runs.squares(task, "never", episodes, seed)
@@ -446,15 +443,14 @@ def _draw_table(figure: Any, data: Data, name: str) -> None:
 def _curves_of(
     piece: str, kind: str, height: float, panels: Sequence[tuple[str, int]], *names: str
 ) -> PaperFigure:
-    target = piece == "target"
-    step, without = (_TARGET_STEP, ("interval", "variance")) if target else (_STEP, ())
+    step = _TARGET_STEP if piece == "target" else _STEP
     draw = partial(_draw_curves, kind=kind, panels=panels, names=names, step=step)
-    return PaperFigure(piece, draw, (7.2, height), without=without)
+    return PaperFigure(piece, draw, (7.2, height))
 
 
 def _table(name: str) -> PaperFigure:
     draw = partial(_draw_table, name=name)
-    return PaperFigure("tables", draw, (7.2, 3.8), {"tables": [name]})
+    return PaperFigure("tables", draw, (7.2, 3.8))
 
 
 _summarise_oscillator = partial(_summarise_curves, name="oscillator", states=("x1", "x2", "b"))
@@ -501,11 +497,5 @@ PAPER = Paper(
             "target", "rmse", 3.4, (("acceleration RMSE (m/s²)", 2),), "aware", "least"
         ),
     },
-    runs.OSCILLATOR,
-    {
-        "interval": Parameter(tuple(TABLE_II), checks.numbers_within(above=0.0)),
-        "variance": Parameter(tuple(TABLE_III), checks.numbers_within(above=0.0)),
-        "policy": Parameter("periodic:period=2", checks.policy_of()),
-    },
-    ("horizon", "process_covariance", "bias_noise_covariance"),
+    {"interval": tuple(TABLE_II), "variance": tuple(TABLE_III), "policy": "periodic:period=2"},
 )  # fmt: skip

@@ -3,17 +3,15 @@
 Source: tobit_token_bucket, Section 4.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from agents.papers import checks
 from agents.papers import tobit_token_bucket_runs as runs
 from agents.papers.drawing import legend, stack
 from agents.papers.numbers import grid
-from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
+from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
 from agents.papers.tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
 from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
@@ -103,18 +101,13 @@ def _summarise_network(data: Data) -> Data:
 # --- states and estimates -------------------------------------------------------------------------
 
 
-def simulate_estimates(
-    episodes: int, seed: int, settings: Settings, singles: Sequence[int] = _NODES
-) -> Data:
-    """Return states, local and fused estimates, and their changes from step to step.
-
-    ``singles`` are the sensors whose filters also run without the others.
-    """
+def simulate_estimates(episodes: int, seed: int, settings: Settings) -> Data:
+    """Return states, local, single and fused estimates, and their changes from step to step."""
     result = _record(episodes, seed, settings)
     local = np.abs(np.diff(result.truth[:, None] - result.local_mean, axis=0))
     fused = np.abs(np.diff(result.truth - result.mean, axis=0))
     censored = (result.measurement <= 0.0)[1:]
-    alone = [runs.single_sensor(m, **settings["options"]) for m in singles]
+    alone = [runs.single_sensor(m, **settings["options"]) for m in _NODES]
     nodes = [record_history(task, episodes, seed) for task in alone]
     return {
         "truth": result.truth[..., 0], "local": result.local_mean[..., 0],
@@ -351,7 +344,6 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
 
 
 _SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)
-_NO_SINGLES: Settings = {"singles": ()}
 PAPER = Paper(
     "tobit_token_bucket",
     (
@@ -365,19 +357,13 @@ PAPER = Paper(
         "figure_2": PaperFigure("network", _draw_tokens, _SIZE),
         "figure_3": PaperFigure("network", partial(_draw_measurements, component=0), _TALL),
         "figure_4": PaperFigure("network", partial(_draw_measurements, component=1), _TALL),
-        "figure_5": PaperFigure("estimates", partial(_draw_states, sensor=0), _SIZE, _NO_SINGLES),
-        "figure_6": PaperFigure("estimates", partial(_draw_states, sensor=1), _SIZE, _NO_SINGLES),
-        "figure_7": PaperFigure("estimates", partial(_draw_states, sensor=2), _SIZE, _NO_SINGLES),
+        "figure_5": PaperFigure("estimates", partial(_draw_states, sensor=0), _SIZE),
+        "figure_6": PaperFigure("estimates", partial(_draw_states, sensor=1), _SIZE),
+        "figure_7": PaperFigure("estimates", partial(_draw_states, sensor=2), _SIZE),
         "figure_8": PaperFigure("errors", partial(_draw_errors, sensor=0), (7.2, 5.4)),
         "figure_9": PaperFigure("errors", partial(_draw_errors, sensor=1), (7.2, 5.4)),
         "figure_10": PaperFigure("errors", partial(_draw_errors, sensor=2), (7.2, 5.4)),
     },
-    "fusion_gym/TobitOscillator-v1",
-    {"policy": Parameter(TRIGGER, checks.policy_of())},
-    (
-        *("horizon", "token_rate", "token_capacity", "initial_tokens"),
-        *("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial"),
-        *("process_noise", "process_variance", "measurement_variance"),
-    ),
+    {"policy": TRIGGER},
     READINGS,
 )

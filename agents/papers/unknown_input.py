@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
-from agents.papers import checks
 from agents.papers import unknown_input_recursion as recursion
 from agents.papers.drawing import legend, set_ticks
 from agents.papers.numbers import below, estimate, grid
-from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings
+from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
 from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -119,24 +118,19 @@ def leading(errors: Array, bounds: Array) -> Array:
 # --- the printed example beside two carts ---------------------------------------------------------
 
 
-def simulate_filters(
-    episodes: int, seed: int, settings: Settings, lanes: tuple[str, ...] = tuple(LANES)
-) -> Data:
+def simulate_filters(episodes: int, seed: int, settings: Settings) -> Data:
     """Return all data by example, ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane too."""
-    data: Data = {"lanes": list(lanes)}
+    data: Data = {"lanes": list(LANES)}
     for example in EXAMPLES:
-        result = _example(example, episodes, seed, settings, lanes)
+        result = _example(example, episodes, seed, settings)
         data |= {f"{example}_{name}": value for name, value in result.items()}
     return data
 
 
-def _example(
-    example: str, episodes: int, seed: int, settings: Settings, lanes: tuple[str, ...]
-) -> Data:
+def _example(example: str, episodes: int, seed: int, settings: Settings) -> Data:
     data: Data = {}
     mse, rates = [], []
-    for name in lanes:
-        policy, options = LANES[name]
+    for name, (policy, options) in LANES.items():
         policy = settings["policy"] if policy == TRIGGER else policy
         own = _options_of(example, settings)
         options = options | own | {"example": example}
@@ -448,8 +442,8 @@ def _draw_instants(figure: Any, data: Data) -> None:
         axis.grid(False, axis="y")
 
 
-def _figure(draw: Any, height: float, *lanes: str) -> PaperFigure:
-    return PaperFigure("filters", draw, (7.6, height), {"lanes": (OURS, *lanes)})
+def _figure(draw: Any, height: float) -> PaperFigure:
+    return PaperFigure("filters", draw, (7.6, height))
 
 
 PAPER = Paper(
@@ -459,8 +453,8 @@ PAPER = Paper(
         Piece("printed", simulate_printed, _summarise_printed, 60.0, 500),
     ),
     {
-        "figure_1": _figure(partial(_draw_estimates, entries=_STATES), 5.0, WALK),
-        "figure_2": _figure(partial(_draw_estimates, entries=_INPUTS), 5.0, WALK),
+        "figure_1": _figure(partial(_draw_estimates, entries=_STATES), 5.0),
+        "figure_2": _figure(partial(_draw_estimates, entries=_INPUTS), 5.0),
         **{
             f"figure_{3 + place}": _figure(
                 partial(
@@ -476,9 +470,6 @@ PAPER = Paper(
         ),
         "figure_7": _figure(_draw_instants, 2.6),
     },
-    "fusion_gym/UnknownInput-v1",
-    {"policy": Parameter(TRIGGER, checks.policy_of(TRIGGER))},
-    (*("horizon", "rho_bar", "rho_initial", "adaptation"),
-     *("input_signal", "input_amplitude", "input_period")),
+    {"policy": TRIGGER},
     READINGS,
 )  # fmt: skip

@@ -59,7 +59,7 @@ BASES: dict[str, dict[str, list[str]]] = {
     "info": {"name": ["whittle"]},
     "table": {"config": ["rows.yaml"], "episodes": ["2"]},
     "papers": {
-        "papers": ["markov_jump"], "figure": ["5"], "output": ["made"], "work": ["made_too"],
+        "papers": ["markov_jump"], "output": ["made"], "work": ["made_too"],
         "episodes": ["2"],
     },
     "watch": {"env": [ENV], "set": ["horizon=4"], "policy": ["always"], "save": ["made.gif"]},

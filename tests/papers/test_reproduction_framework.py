@@ -14,7 +14,7 @@ from command_runs import Ended, call
 from hostile_folder import contents
 from paths import ROOT
 
-from agents.papers import checks, page, paper
+from agents.papers import page, paper
 from agents.papers.numbers import FAILS, HOLDS, Number
 from fusion_gym.validation import ConfigurationError
 
@@ -60,8 +60,7 @@ def a_paper(name: str, calls: Calls) -> paper.Paper:
 
     return paper.Paper(
         name, [a_piece(piece) for piece in PIECES],
-        {"figure_5": paper.PaperFigure("first", draw, (2.0, 1.5))}, "fusion_gym/TobitOscillator-v1",
-        {"m": paper.Parameter((0.5,), checks.numbers_within(at_least=0.0))}, ("horizon",),
+        {"figure_5": paper.PaperFigure("first", draw, (2.0, 1.5))},
     )  # fmt: skip
 
 
@@ -267,16 +266,6 @@ def test_a_page_has_all_that_is_shown(calls: Calls) -> None:
             assert len(re.findall(r"(?<!\\)\|", line)) == 5
 
 
-def test_a_figure_simulates_its_piece_with_its_parameters(calls: Calls) -> None:
-    words = ["--figure", "5", "--set", "m=0.7,0.2", "--episodes", "40"]
-    reproduce("one", *words)
-    assert calls == [("one/first", 40, 0)]
-    assert set(pages()) == {"one", "one/figure_5.png", "one/figure_5.svg"}
-    reproduce("one", *words, "--resume")
-    reproduce("one", *words[:2], "--episodes", "40", "--resume")  # without the parameter
-    assert len(calls) == 2
-
-
 # --- what is refused ----------------------------------------------------------------------------
 
 
@@ -287,11 +276,6 @@ def test_a_figure_simulates_its_piece_with_its_parameters(calls: Calls) -> None:
         (["one", "three"], ["paper = 'three'"]),
         ([], ["papers", "one", "two", "all"]),
         (["one", "--episodes", "1"], ["episodes = 1", "2"]),
-        (["all", "--figure", "5"], ["papers = ('all',)", "figure = '5'", "a single paper"]),
-        (["one", "--set", "m=0.7"], ["set = 'm'", "--figure"]),
-        (["one", "--figure", "5", "--set", "m=-1"], ["m = -1", ">= 0.0"]),
-        (["one", "--figure", "5", "--set", "m=1,1"], ["m = (1, 1)", "different numbers"]),
-        (["one", "--figure", "5", "--set", "n=1"], ["'n'", "known are horizon, m"]),
     ],
 )
 def test_one_clear_error_before_anything_runs(

@@ -7,20 +7,15 @@ of the committed sample, from its 95 % interval: the fresh one is too small to t
 
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
-from command_runs import call
-from matplotlib.text import Text
 from paths import ROOT
 
 from agents.papers.numbers import UNDECIDED
 from agents.papers.page import draw_figure, render_page
 from agents.papers.paper import NAMES, Data, Paper, load_paper
-from agents.papers.reproduce import reproduce_figure
 from fusion_gym.output import palette
-from fusion_gym.policies.settings import parse_settings
 
 PAGES = ROOT / "docs" / "reproduction"
 ERRORS = 4.5  # of both samples together
@@ -98,27 +93,3 @@ def test_the_page_is_that_of_a_fresh_run(name: str) -> None:
     check_numbers(page, fresh, episodes)
     check_claims(page, fresh, name)
     check_pictures(paper, data)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "figure", "changes", "label"),
-    [
-        ("markov_jump", "5", {"m": "0.7", "policies": "random:rate=0.3"}, "m = 0.7"),
-        ("adaptive_innovation", "7", {"scales": "0.5,0.9"}, "(b) 0.9 of bounds"),
-        ("round_robin_tobit", "table_2", {"interval": "2,1"}, "[-1, 1]"),
-        ("round_robin_tobit", "5", {"policy": "round_robin:period=2"}, "RMSE1 (of x1)"),
-    ],
-)
-def test_a_figure_has_parameters(
-    name: str, figure: str, changes: dict[str, str], label: str, tmp_path: Path
-) -> None:
-    texts = [f"{key}={value}" for key, value in changes.items()]
-    if figure == "table_2":  # a table is the fastest
-        words = [name, "--figure", figure, "--episodes", "2", "--set", *texts, "--workers", "1"]
-        ended = call("papers", [*words, "--output", str(tmp_path), "--work", str(tmp_path)])
-        assert ended.status == 0, ended.err
-        assert {path.suffix for path in tmp_path.rglob("*_*.*")} >= {".png", ".svg"}
-    drawing = reproduce_figure(name, figure, 2, **parse_settings("option", texts))
-    assert label in {text.get_text() for text in drawing.findobj(Text)}
-    palette.plt.close(drawing)

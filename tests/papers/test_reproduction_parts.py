@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +36,6 @@ from agents.papers.walk import SomeSensors
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.metrics import Interval
-from fusion_gym.validation import ConfigurationError
 
 SEED = 1_000_000
 
@@ -455,19 +453,6 @@ def test_inverses_are_those_of_the_printed_formulas(fusion: str) -> None:
     fused = rule.fuse(np.zeros((2, 3, 1)), both).covariance
     least = minimize_scalar(trace, bounds=(0.0, 1.0), method="bounded").fun
     assert np.trace(fused[..., 0]) == pytest.approx(least, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("paper", "changes"),
-    [
-        (adaptive_innovation, {"start_ratio": 1.1}), (adaptive_innovation, {"own_ratio": 0.0}),
-        (adaptive_innovation, {"same_step": 2}), (markov_jump, {"reference": -1.0}),
-    ],
-)  # fmt: skip
-def test_values_of_readings_are_checked(paper: Any, changes: dict[str, Any]) -> None:
-    (name,) = changes
-    with pytest.raises(ConfigurationError, match=f"{name} = "):
-        paper.PAPER.settings(changes)
 
 
 def test_a_bound_is_reported_from_what_is_none() -> None:
