@@ -72,7 +72,9 @@ coverage: $(STAMP)  ## what the journeys reach: files by share, functions in run
 # One episode of every environment under its paper's rule, for the pages.
 WATCH := $(BIN)/fusion-gym watch --steps 40 --fps 6 --env fusion_gym
 films: $(STAMP)  ## the films of docs/films
-	$(WATCH)/TobitOscillator-v1 --policy dynamic_event --save docs/films/tobit_oscillator.gif
+	$(BIN)/fusion-gym watch --env fusion_gym/TobitOscillator-v1 --fps 6 --policy zoo:tobit_oscillator_scheduler,price=0.2 \
+		--against dynamic_event --save docs/films/tobit_oscillator.gif --set horizon=60 filter=tobit random_start=true \
+		token_rate=2.0 memory=true cost_weight=0.2
 	$(WATCH)/BiasedOscillator-v1 --policy round_robin --save docs/films/biased_oscillator.gif
 	$(WATCH)/BiasedTracking-v1 --policy round_robin --save docs/films/biased_tracking.gif
 	$(WATCH)/CorrelatedTracking-v1 --policy adaptive_innovation --save docs/films/correlated_tracking.gif
@@ -106,7 +108,7 @@ integrations-rejax: .venv-rejax/.installed  ## rejax
 integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
 
-benchmark: $(STAMP)  ## triggers, rules and learned policies of every class, 110 minutes: results/
+benchmark: $(STAMP)  ## triggers, rules and learned policies of every class, 130 minutes: results/
 	$(BIN)/python -m agents.benchmark
 
 papers: $(STAMP)  ## the five papers' figures, tables and claims: docs/reproduction/

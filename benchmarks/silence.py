@@ -25,7 +25,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.docstrings import table
 from fusion_gym.entries import Options
 from fusion_gym.evaluation import run_episodes, summarise
-from fusion_gym.output.figures import save_figure
+from fusion_gym.output.figures import plain_tick, save_figure
 from fusion_gym.output.files import write
 
 PAGE = Path(__file__).parent.parent / "docs" / "silence.md"
@@ -151,9 +151,8 @@ def main(episodes: int = 1000, resume: bool = False, folder: Path = Path("runs/s
         text = replaced(text, name, content)
         panel.set_xticks(RATES, map(str, RATES))
         panel.xaxis.set_minor_formatter("")
-        panel.yaxis.set_major_formatter("{x:g}")
-        panel.yaxis.set_minor_formatter("{x:g}")
-        panel.set(title=name, xlabel="packets a sensor and step", ylabel="mean squared error")
+        panel.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
+        panel.set(title=name, xlabel="packets per sensor and step", ylabel="mean squared error")
     panels[0].legend(fontsize=8)
     figure.tight_layout()
     save_figure(figure, PAGE.with_name("silence.png"))

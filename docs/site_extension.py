@@ -49,18 +49,12 @@ def lead_to_names(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def fold(app: Sphinx, doctree: nodes.document, name: str) -> None:
-    """Fold long tables and blocks of code, and the reproduced figures below their headings."""
-    papers = name.startswith("docs/reproduction/")
-    for node in list(doctree.findall(nodes.table)):
-        rows = list(node.findall(nodes.row))
-        if len(rows) > (6 if papers else 13):
-            head = ", ".join(entry.astext() for entry in rows[0].children)
-            node.parent.replace(node, _folded(f"{len(rows) - 1} rows: {head}", [node]))
+    """Fold long blocks of code, and the reproduced figures below their headings."""
     for block in list(doctree.findall(nodes.literal_block)):
         lines = block.astext().splitlines()
         if len(lines) > 80:
             block.parent.replace(block, _folded(f"{len(lines)} lines", [block]))
-    if papers:
+    if name.startswith("docs/reproduction/"):
         for node in doctree.findall(nodes.section):
             if re.match("Figure|Table", node[0].astext()):
                 node[1:] = _folded("the picture", node[1:])

@@ -18,6 +18,7 @@ from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in, short
 from fusion_gym.envs.registration import ENVIRONMENTS, make_task, options_of
+from fusion_gym.envs.returns import read_returns, reward_threshold
 from fusion_gym.envs.views import make_view
 from fusion_gym.errors import ConfigurationError
 from fusion_gym.evaluation.metrics import metric_table
@@ -34,6 +35,14 @@ _INTERFACES = {
     "P": ("", "periodic_optimum:packets=1,period=1"),
     "S": ("", "optimal"),
 }
+ENVIRONMENT_PAGE = Path(__file__).with_name("environments.md")
+_PAPERS = {
+    "tobit_oscillator.md": (1, "tobit_token_bucket"),
+    "correlated_tracking.md": (2, "adaptive_innovation"),
+    "markov_jump.md": (3, "markov_jump"),
+    "biased.md": (4, "round_robin_tobit"),
+    "unknown_input.md": (5, "unknown_input"),
+}  # by the page of an environment
 _LEGEND = "Only sensors know an entry with a star ([who knows what](concepts.md#who-knows-what))."
 _WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
 
@@ -162,11 +171,37 @@ def name_table(text: str) -> str:
     return table(("name", "meaning"), rows)
 
 
+def return_table(text: str) -> str:
+    """Return the environments with their papers, sensors and returns.
+
+    Args:
+        text: the kinds of policies, separated by semicolons; ``tuned rule`` is the better one.
+    """
+    kinds = [kind.strip() for kind in text.split(";")]
+    pages_of = dict(re.findall(r"\[`(\w+-v\d)`\]\((\w+\.md)\)", ENVIRONMENT_PAGE.read_text()))
+    rows = []
+    for env_id in ENVIRONMENTS:
+        name, task = env_id.rpartition("/")[2], make_task(env_id)
+        paper, bucket = _PAPERS.get(pages_of[name]), task.network.bucket
+        means = {row.kind: row.mean for row in read_returns() if row.environment == env_id}
+        means["tuned rule"] = reward_threshold(env_id) or 0.0
+        cells = (f"{means[kind]:.4g}".replace("-", "−") if kind in means else "–" for kind in kinds)
+        rows.append((
+            f"[`{name}`](docs/{pages_of[name]})",
+            f"[{paper[0]}](docs/reproduction/{paper[1]}.md)" if paper else "–",
+            f"`{make_view(task).actions}`",
+            "unlimited" if bucket.unlimited else f"{bucket.rate:g} per step",
+            *cells,
+        ))  # fmt: skip
+    return table(("environment", "paper", "action", "tokens", *kinds), rows)
+
+
 TABLES = {
     "access": access_table, "algorithms": algorithm_table, "facts": fact_table,
     "filters": filter_table, "fusion": fusion_table, "metrics": metric_table, "names": name_table,
     "networks": network_table,
     "observation": observation_table, "options": option_table, "policies": policy_table,
+    "returns": return_table,
 }  # fmt: skip
 PART = re.compile(r"(?ms)^(<!-- table: (\w+)\s([^>]+?)\s-->\n).*?^(<!-- end -->)$")
 
@@ -187,7 +222,8 @@ def _meaning(owner: Any) -> str:
 
 
 if __name__ == "__main__":
-    for path in sorted(Path(__file__).parent.rglob("*.md")):
+    folder = Path(__file__).parent
+    for path in (folder.parent / "README.md", *sorted(folder.rglob("*.md"))):
         text = path.read_text(encoding="utf-8")
         if (new := written(text)) != text:
             if "--check" in sys.argv:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 
 from agents.benchmark import evidence
 from agents.benchmark.evidence import CALIBRATED
 from agents.benchmark.settings import CLASSES, Setting, Suite
 from fusion_gym.arrays import Array
 from fusion_gym.docstrings import table
-from fusion_gym.output.figures import save_figure
+from fusion_gym.output.figures import plain_tick, save_figure
 from fusion_gym.output.files import replacing, write_text
 from fusion_gym.output.palette import READABLE
 from fusion_gym.version import __version__
@@ -131,7 +130,7 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
             ),
         ),
         *(
-            f"## {title}\n\n![Error against tokens a step, by class]({name}.png)"
+            f"## {title}\n\n![Error against tokens per step, by class]({name}.png)"
             for name, title in titles.items()
         ),
     ]
@@ -306,7 +305,7 @@ def draw_setting(rows: Sequence[evidence.TestRow], title: str, folder: Path) -> 
     for panel, name in zip(panels[0], names, strict=True):
         labels |= draw_class(panel, [row for row in rows if row.name == name])
         panel.set(title=TITLES[name])
-    panels[0][0].set_ylabel("error a step")
+    panels[0][0].set_ylabel("error per step")
     figure.suptitle(title)
     figure.tight_layout(rect=(0.0, 0.08, 1.0, 1.0))
     figure.legend(list(labels.values()), list(labels), loc="lower center", ncols=5)
@@ -314,43 +313,20 @@ def draw_setting(rows: Sequence[evidence.TestRow], title: str, folder: Path) -> 
 
 
 def draw_class(panel: Axes, rows: Sequence[evidence.TestRow]) -> dict[str, Line2D]:
-    """Draw error against tokens in one class, and return the lines by label.
-
-    Points without tokens stand at a tick "0" of their own, left of a dotted line.
-    """
-    zero = min(row.tokens for row in rows if row.tokens > 0.0) / 2.5
+    """Draw error against tokens in one class, and return the lines by label."""
     labels = {}
     for kind in ("trigger", "rule", "learned", "optimum"):
         label, colour, marker = STYLES[kind]
         _, _, error, tokens = mean_line(rows, kind)
         if len(error):
-            style: Any = {"color": colour, "marker": marker, "markersize": 5}
-            order = np.argsort(tokens)[np.count_nonzero(tokens == 0.0) :]
-            (labels[label],) = panel.plot(tokens[order], error[order], linewidth=1, **style)
-            silent = error[tokens == 0.0]
-            panel.plot(np.full(len(silent), zero), silent, linestyle="", **style)
-    panel.set(xscale="log", yscale="log", xlabel="tokens a step")
-    silence = any(row.tokens == 0.0 for row in rows)
-    if silence:
-        panel.axvline(1.5 * zero, color="tab:gray", linestyle=":", linewidth=1)
-    plain_ticks(panel.yaxis)
-    plain_ticks(panel.xaxis, zero if silence else None)
+            line = np.array([tokens, error])[:, np.argsort(tokens)]
+            (labels[label],) = panel.plot(*line, color=colour, marker=marker, lw=1, ms=5)
+    least = min(row.tokens for row in rows if row.tokens > 0.0)
+    panel.set_xscale("symlog", linthresh=10.0 ** math.floor(math.log10(least)), linscale=0.5)
+    panel.set(yscale="log", xlabel="tokens per step", xlim=(0.0, None))
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
     return labels
-
-
-def plain_ticks(axis: Axis, zero: float | None = None) -> None:
-    """Write the ticks of a logarithmic axis as plain numbers, and "0" at the place of zero."""
-    low, high = axis.get_view_interval()
-    low = low if zero is None else 1.5 * zero
-    values: list[float] = []
-    for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)):
-        if len(values) < 3:
-            values = [d * 10.0**power for power in range(-6, 7) for d in digits]
-            values = [value for value in values if low <= value <= high]
-    ticks = {value: f"{value:g}" for value in values} | ({} if zero is None else {zero: "0"})
-    axis.set_major_locator(FixedLocator(list(ticks)))
-    axis.set_major_formatter(FixedFormatter(list(ticks.values())))
-    axis.set_minor_locator(NullLocator())
 
 
 def print_classes(rows: Sequence[evidence.ClassRow], points: Sequence[evidence.PointRow]) -> None:

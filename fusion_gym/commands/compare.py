@@ -64,6 +64,10 @@ class Compare(Long):
 
     def run(self) -> None:
         """Run all policies on the same seeds, and write, print and draw the comparison."""
+        self.points()
+
+    def points(self) -> "list[Point]":
+        """Run the command, and return the policy at each price."""
         world = load_checked(Experiment, self.config).environment
         sweep = load_checked(Sweep, self.sweep, "sweep")
         task = make_task(world.id, **world.options)
@@ -73,7 +77,7 @@ class Compare(Long):
         writing(("evaluation, comparison and figure", self.output))
         rules = sweep.policies(task.reward.price)
         baselines = run_all(task, rules, self.episodes, self.seed, "baselines")
-        compare(world.id, task, sweep, baselines, requested, self.seed, self.output)
+        return compare(world.id, task, sweep, baselines, requested, self.seed, self.output)
 
     def policies_of(self, task: Task) -> dict[str, float]:
         """Return the policy, or the policy at each price, with the price of a token."""
@@ -108,7 +112,7 @@ def run_all(
 def compare(
     env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
     policies: Mapping[str, float], seed: int, folder: Path,
-) -> None:  # fmt: skip
+) -> "list[Point]":  # fmt: skip
     """Run the policy on the baselines' episodes, and write, print and draw the comparison."""
     episodes, label = next(iter(baselines.values())).episodes, _label(next(iter(policies)))
     results = run_all(task, list(policies), episodes, seed, label)
@@ -141,6 +145,7 @@ def compare(
     sensors = f"{task.sensors} sensor{'s' * (task.sensors > 1)}"
     title = f"{name}, {sensors}: {label} against the best rule at the same price"
     figures.pareto(folder / "pareto.png", title, lines, [point.at_price for point in points])
+    return points
 
 
 def other_curves(

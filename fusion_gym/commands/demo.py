@@ -5,21 +5,27 @@
 One agent learns in LinearFusion and one in the Tobit oscillator. Each agent observes all new
 measurements and the price of a token, with memory of unsent measurements. A table shows its cost at
 seven prices and the cost of the best rule of ``scale_free_sweep``, with the same memory and on the
-same episodes.
+same episodes. Four lines at the end say what the agents save, also against the oscillator's paper.
 """
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+
 from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.compare import Compare
+from fusion_gym.commands.compare import Compare, Point, run_all
 from fusion_gym.commands.options import OUTPUT_FOLDER, Episodes, Steps
 from fusion_gym.commands.train import Train
+from fusion_gym.envs.registration import make_task
 from fusion_gym.output.progress import remark
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import holds_training
 from fusion_gym.validation import ConfigurationError
 
@@ -48,17 +54,37 @@ class Demo(Long):
             remark("waiting for the training beside this one")
         for training in beside:
             training.result()
+        savings = []
         for name in CONFIGS:
             folder = self.output / name
             agent = folder / "agent"
-            Compare(
+            points = Compare(
                 config=str(agent / "config.yaml"),
                 sweep="scale_free_sweep",
                 policy=f"model:{agent / 'calibrated_model.zip'}",
                 prices=7,
                 episodes=self.episodes,
                 output=folder / "comparison",
-            ).run()
+            ).points()
+            savings.append(f"{-np.mean([point.at_price.relative for point in points]):.1%}")
+        paper = self._saving(agent / "config.yaml", points)
+        lines = {
+            "trained": f"{len(CONFIGS)} agents, calibrated: {', '.join(CONFIGS)}",
+            "saved against the best rule at each price": ", ".join(savings),
+            f"saved against the paper's trigger ({name})": f"{paper:.1%}",
+            "pictures": self.output / "*" / "comparison" / "pareto.png",
+        }
+        print("\n".join(f"{title:50} {text}" for title, text in lines.items()))
+
+    def _saving(self, config: Path, points: Sequence[Point]) -> float:
+        """Return the share of the tuned trigger's cost that the oscillator's agent saves."""
+        world = load_checked(Experiment, str(config)).environment
+        task = make_task(world.id, **world.options)
+        scales = [f"dynamic_event:scale={scale:.3g}" for scale in np.geomspace(0.1, 100.0, 24)]
+        triggers = run_all(task, scales, self.episodes, 0, "the paper's trigger").values()
+        costs = [p.at_price.cost + p.at_price.difference.mean for p in points]
+        least = [min(float(t.cost(p.at_price.price).mean()) for t in triggers) for p in points]
+        return float(np.mean(1.0 - np.divide(costs, least)))
 
     def _training(self, name: str) -> Train:
         agent = self.output / name / "agent"

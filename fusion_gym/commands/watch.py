@@ -73,7 +73,7 @@ class Watch(EnvironmentOptions, Long):
         return "interrupted" if self.save is None else f"interrupted: no film in {self.save}"
 
     def _counted(self, frames: Iterator[Frame], task: Task) -> Iterator[Frame]:
-        with progress_bar((self.steps or task.horizon) + 1, "filming") as bar:
+        with progress_bar(self.steps or task.horizon, "filming") as bar:
             for frame in frames:
                 yield frame
                 bar.update()

@@ -79,8 +79,12 @@ class Film:
         run: int = 0,
         title: str | None = None,
         limits: Sequence[tuple[float, float]] | None = None,
+        truth: Array | None = None,
     ) -> Frame:
-        """Return the picture of a run's present episode, by default with the step as title."""
+        """Return the picture of a run's present episode, by default with the step as title.
+
+        ``truth`` (steps, shown) are the states of the whole film, drawn faintly.
+        """
         if self._figure is None:
             self._draw_frame()
         age, steps = int(self._ages[run]), self._recent_steps(run)
@@ -88,6 +92,9 @@ class Film:
         first = max(age - self._window, 0)
         self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
         self._draw_states(times, steps, run, self.limits(run) if limits is None else limits)
+        if truth is not None:
+            for place, lines in enumerate(self._curves):
+                lines[3].set_data(np.arange(len(truth)) + 1, truth[:, place])
         pairs = [(s.outcome.requested[:, run], s.outcome.granted[:, run]) for s in steps]
         answers = np.array(pairs, dtype=np.bool_).reshape(-1, 2, self.task.sensors)
         requested, granted = answers.swapaxes(0, 1)
@@ -99,6 +106,10 @@ class Film:
         self._axes[-1].set_xlim(first, first + self._window + 1)
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def truth(self, run: int = 0) -> Array:
+        """Return the drawn states (shown,) of a run after its last step."""
+        return self._series(self._recent_steps(run)[-1:], run)[0][0]
 
     def _recent_steps(self, run: int) -> list[_Step]:
         """Return the recorded steps of this run's episode in the window."""
@@ -167,7 +178,8 @@ class Film:
                 label = None if np.isfinite(low) else "censored"
                 axis.axhspan(high, 1e9, color=_CENSORED, alpha=0.15, lw=0, label=label)
             axis.set_ylabel(name)
-            self._curves.append([truth, mean, band])
+            (whole,) = axis.plot([], [], color=_TRUTH, lw=1.0, alpha=0.3)
+            self._curves.append([truth, mean, band, whole])
         sensors, bucket = self.task.sensors, self.task.network.bucket
         requests = self._axes[len(self._state_names)]
         (granted,) = requests.plot([], [], "|", color=_GRANTED, ms=9, mew=2, label="granted")

@@ -22,6 +22,7 @@ from fusion_gym.core.scale import rehearse, resolve
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.option_text import Option, list_options, options_in
+from fusion_gym.envs.returns import reward_threshold
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.importing import imported, name_of
 from fusion_gym.option_file import load_yaml
@@ -120,7 +121,10 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
         if name not in gymnasium.registry:
             single, vector = (f"{_REGISTERED}:{class_name(name)}{end}" for end in _CLASSES)
             gymnasium.register(name, entry_point=single, vector_entry_point=vector)
-            gymnasium.registry[name] = FusionSpec(name, single, vector_entry_point=vector)
+            threshold = reward_threshold(name)
+            gymnasium.registry[name] = FusionSpec(
+                name, single, threshold, vector_entry_point=vector
+            )
 
 
 def id_of(name: str) -> str | None:

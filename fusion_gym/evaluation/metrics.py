@@ -71,8 +71,8 @@ def mean_interval(samples: Array, seed: int = 0) -> Interval:
     share = sizes[len(sizes) - len(sizes) // 100 :].sum() / sizes.sum()
     if share > _HEAVY:
         warnings.warn(
-            f"the largest 1 % of {len(sizes)} samples have {100 * share:.0f} % of their sum: the "
-            "mean has a heavy tail, and its interval may miss the expectation",
+            f"the largest 1 % of the samples have over {_HEAVY:.0%} of their sum: the mean has a "
+            "heavy tail, and its interval may miss the expectation",
             stacklevel=2,
         )
     from scipy import stats  # takes a third of a second

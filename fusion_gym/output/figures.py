@@ -36,7 +36,7 @@ def pareto(
     means = np.array([result.mse.mean() for line in lines for result in line.results])
     if means.max() > 6 * means.min():
         front.set_yscale("log")
-        front.yaxis.set(major_formatter=_plain_tick, minor_formatter=_plain_tick)
+        front.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
     front.set_xlim(left=-0.005)
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
     front.legend(fontsize=8, loc="upper right")
@@ -45,12 +45,12 @@ def pareto(
     beside.axhline(0.0, color=BLUE, lw=1.6)
     beside.errorbar(places, 100.0 * mean, yerr=spread, color=AGENT, marker="o", ms=5, capsize=3)
     beside.set_xticks(places, [f"{c.price:.3g}" for c in costs])
-    below = f"price of a token; below 0: {lines[-1].label} is cheaper"
-    beside.set(xlabel=below, ylabel="cost above the best rule's at this price [%]")
+    cost = f"cost above the best rule's [%]\n(below 0: {lines[-1].label} is cheaper)"
+    beside.set(xlabel="price of a token", ylabel=cost)
     save_figure(figure, path)
 
 
-def _plain_tick(value: float, place: float | None = None) -> str:
+def plain_tick(value: float, place: float | None = None) -> str:
     """Return the label of a logarithmic axis at 1, 2, 3 and 5 times powers of ten."""
     text = f"{value:g}"
     return text if f"{value:.0e}"[0] in "1235" else ""

@@ -18,11 +18,13 @@ from scipy import stats
 import fusion_gym
 from agents import cache
 from agents.benchmark import evidence, rules, settings, training, verdict
+from agents.benchmark.calibration import CalibrationResult
 from agents.benchmark.report import draw_class, mean_text
 from agents.benchmark.settings import CLASSES, knowledge_of, load_suite
 from agents.benchmark.verdict import cost_difference, discoveries, mean_difference
 from fusion_gym.core.knowledge import covers
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.calibrated import CalibrationPoint
 from fusion_gym.policies.registry import make_policy
 
 SMALL = {
@@ -223,20 +225,18 @@ def test_a_median_stands_beside_a_mean_that_an_outlier_moves() -> None:
     assert mean_text(evidence.ClassRow("a", "b", "bound", -0.1, -0.1, -0.1, -0.1)) == "−10.0"
 
 
-def test_points_without_tokens_have_a_tick_and_no_line() -> None:
+def test_points_without_tokens_stand_at_zero() -> None:
     rows = [
         evidence.TestRow("a", "local", "trigger", 0, 0.1, price, 1.0, error, tokens, 0.0, 0.0, "")
         for price, error, tokens in ((0.1, 0.2, 2.0), (1.0, 0.5, 0.02), (9.0, 0.9, 0.0))
     ]
-    _, panel = plt.subplots()
+    figure, panel = plt.subplots()
     assert list(draw_class(panel, rows)) == ["tuned trigger"]
-    line, alone, _ = panel.get_lines()
-    assert sorted(line.get_xdata()) == [0.02, 2.0]
-    assert (list(alone.get_ydata()), alone.get_linestyle()) == ([0.9], "None")
-    ticks = dict(zip(panel.get_xticks(), panel.get_xticklabels(), strict=True))
-    assert ticks[alone.get_xdata()[0]].get_text() == "0"
-    assert {"0.1", "1"} <= {label.get_text() for label in ticks.values()}
-    assert len(panel.get_yticks()) >= 3
+    (line,) = panel.get_lines()
+    assert list(line.get_xdata()) == [0.0, 0.02, 2.0]
+    figure.canvas.draw()
+    assert {"0", "0.1", "1"} <= {label.get_text() for label in panel.get_xticklabels()}
+    assert panel.get_xlim()[0] == 0.0
     plt.close()
 
 
@@ -266,6 +266,30 @@ def test_a_saving_has_the_interval_of_a_ratio_of_means() -> None:
     wide = verdict.saving(several, results(common))
     assert wide[0] == pytest.approx(mean)
     assert wide[2] - wide[1] > 3.0 * (high - low)
+
+
+def test_the_reference_is_the_rule_that_costs_least_in_tuning() -> None:
+    """Whatever it costs in the tests; the learned policy is that rule where it says so."""
+    setting = load_suite().settings[0]
+    item = evidence.Evidence(setting, "local", rules.SweepResult(()))
+    tuning = {"rule": (1.0, 3.0, 2.0, 2.0, 2.0), "trigger": (2.0, 2.0, 2.0, 3.0, 1.0)}
+    tests = {"rule": (1.0, 1.0, 1.0, 1.0, 1.0), "trigger": (5.0, 6.0, 7.0, 8.0, 9.0)}
+
+    def results(costs: Any) -> verdict.TestResult:
+        return results_of(np.full(4, costs))[0]
+
+    item.choice = {kind: tuple(map(results, costs)) for kind, costs in tuning.items()}
+    item.tests = {kind: [tuple(map(results, costs))] for kind, costs in tests.items()}
+    assert item.references == ["rule", "trigger", "rule", "rule", "trigger"]
+    assert [result.cost.mean() for result in item.reference] == [1.0, 6.0, 1.0, 1.0, 9.0]
+    job: Any = None
+    points = [CalibrationPoint(1.0, 0, share, 0.0) for share in (1.0, 0.5, 0.0, 0.0, 0.0)]
+    calibration = CalibrationResult(0.0, 0.0, tuple(points))
+    trained = evidence.Trained(job, 0.0, calibration, Path(), rule_places=(4,))
+    own = tuple(map(results, (0.5, 0.5, 0.5, 0.5, 0.5)))
+    learned = trained.learned(own, item.reference, range(5))
+    assert [result.cost.mean() for result in learned] == [0.5, 0.5, 0.5, 0.5, 9.0]
+    assert trained.rule_points == 2
 
 
 def test_a_rule_is_searched_without_its_threshold() -> None:

@@ -14,6 +14,7 @@ from refusals import refused
 import fusion_gym
 from fusion_gym.commands import watch as command
 from fusion_gym.commands.watch import save_film
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.drawing import Film
 from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
@@ -26,12 +27,12 @@ def frames(*names: str, seed: int = 3, steps: int | None = None, **options: Any)
     return list(watch(task, {name: make_policy(name, task) for name in names}, seed, steps))
 
 
-def test_pictures_stand_side_by_side_one_a_step_and_one_before() -> None:
+def test_pictures_stand_side_by_side_one_a_step() -> None:
     single, both = frames("always"), frames("always", "never")
-    assert len(single) == len(both) == 5
+    assert len(single) == len(both) == 4
     height, width, _ = single[0].shape
     assert all(frame.shape == (height, 2 * width, 3) for frame in both)
-    assert [len(frames("always", steps=steps)) for steps in (1, 2)] == [2, 3]
+    assert [len(frames("always", steps=steps)) for steps in (1, 2)] == [1, 2]
 
 
 def test_a_policy_alone_is_what_the_environment_draws() -> None:
@@ -42,7 +43,25 @@ def test_a_policy_alone_is_what_the_environment_draws() -> None:
         env.step(np.ones(3, dtype=np.int8))
     drawn, watched = env.render(), frames("always")[-1]
     assert drawn.shape == watched.shape
-    np.testing.assert_array_equal(drawn[45:], watched[45:])  # below the title
+    np.testing.assert_array_equal(drawn[-180:], watched[-180:])  # requests and tokens
+
+
+def test_the_axes_of_a_film_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They hold all that any picture shows, and the frames differ by what is drawn alone."""
+    limits: list[Any] = []
+    draw = Film.frame
+    monkeypatch.setattr(
+        Film, "frame", lambda *a, **words: (limits.append(words["limits"]), draw(*a, **words))[1]
+    )
+    frames("always", "never", horizon=12)
+    assert all(own == limits[0] for own in limits)
+    alone = fusion_gym.make_task(TOBIT, horizon=12)
+    film = Film(alone, 1)
+    batch = EpisodeBatch.seeded(alone, 1, 3)
+    for _ in range(12):
+        film.record(batch, batch.step(np.zeros((3, 1), np.bool_)))
+        for (low, high), (least, most) in zip(film.limits(), limits[0], strict=True):
+            assert least <= low <= high <= most
 
 
 def test_a_film_has_axes_for_its_steps_and_panels_for_what_changes() -> None:
@@ -87,7 +106,7 @@ def test_the_command_writes_films(
     with imageio.get_reader(name) as reader:
         film: Any = reader
         visible = [np.asarray(frame)[..., :3] for frame in film]
-    assert len(visible) == 7
+    assert len(visible) == 6
     task = fusion_gym.make_task(TOBIT, horizon=6)
     rules = {name: make_policy(name, task) for name in ("always", "never")}
     for observed, drawn in zip(visible, watch(task, rules), strict=True):

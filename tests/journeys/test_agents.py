@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -170,8 +171,12 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
     titles = [figure.get_suptitle().partition(" against ")[0] for figure in drawn]
     labels = ("Linear fusion, 2 sensors", "Tobit oscillator, 3 sensors")
     assert titles == [f"{label}: the calibrated agent" for label in labels]
-    *_, last = filter(str.strip, printed.splitlines())
-    assert last.strip().startswith("the calibrated agent, mean over prices")
+    assert "the calibrated agent, mean over prices" in printed
+    *_, trained, rules, trigger, pictures = filter(str.strip, printed.splitlines())
+    assert trained.split()[:3] == ["trained", "2", "agents,"]
+    assert re.fullmatch(r"saved against the best rule at each price +-?[\d.]+%, -?[\d.]+%", rules)
+    assert re.fullmatch(r"saved .* paper's trigger \(tobit_oscillator\) +-?[\d.]+%", trigger)
+    assert pictures.endswith("pareto.png")
     for name in demo.CONFIGS:
         folder = tmp_path / name
         assert (folder / "comparison" / "pareto.png").stat().st_size > 20_000

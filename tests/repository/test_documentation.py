@@ -20,6 +20,8 @@ from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 
 README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "results").rglob("*.md")]
+SHOWN = "text", "softbreak"
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
 
 
@@ -32,6 +34,18 @@ def test_what_a_page_links_exists(path: Path) -> None:
             heads = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)
             anchors = [re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads]
             assert part in anchors, f"{name}#{part}"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_markdown_leaves_formulas_as_written(path: Path) -> None:
+    """CommonMark eats backslashes before punctuation, and makes underscores italics."""
+    text = path.read_text()
+    blocks = MarkdownIt().enable("table").parse(text)
+    plain = ("".join(p.content or " " for p in b.children or () if p.type in SHOWN) for b in blocks)
+    shown = " ".join("\n".join(plain).split())
+    bare = re.sub(r"^```.*?^```|`[^`\n]*`", "", text, flags=re.DOTALL | re.MULTILINE)
+    formulas = re.findall(r"\$\$.+?\$\$|\$[^$\n]+?\$", bare, re.DOTALL)
+    assert not [formula for formula in formulas if " ".join(formula.split()) not in shown]
 
 
 QUESTIONS = {

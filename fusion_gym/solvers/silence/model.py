@@ -71,7 +71,7 @@ def _update(prior: Array, matrix: Array, noise: Array) -> tuple[Array, Array]:
 def _parts(task: Task) -> tuple[LinearPlant, CensoredSensors]:
     """Return the task's plant and sensors, if the bound applies to them."""
     plant, estimator = task.plant, task.estimator
-    if not isinstance(plant, CensoredPlant) or not isinstance(estimator, CensoredEstimator):
+    if type(plant) is not CensoredPlant or not isinstance(estimator, CensoredEstimator):
         raise validation.ConfigurationError(
             f"plant = {type(plant).__name__} is not allowed for the bound: the centre must "
             "estimate a linear plant from all measurements, as in TobitOscillator and the biased "

@@ -11,4 +11,5 @@ task = fusion_gym.make_task(env_id)
 for name in ("always", "innovation_threshold:threshold=1,at_most=1", "model:agent.zip"):
     policy = fusion_gym.make_policy(name, task)
     results = fusion_gym.evaluation.run_episodes(task, policy, episodes=400)
-    print(f"{name:43} MSE {results.mse.mean():.3f}  return {results.returns.mean():7.1f}")
+    means = results.returns.mean(), results.mse.mean(), results.tokens.mean()
+    print("{:43} return {:7.1f}  MSE {:.3f}  tokens {:.2f}".format(name, *means))

@@ -1,0 +1,54 @@
+"""The measured returns of every environment, and the threshold of its specification."""
+
+import warnings
+
+import gymnasium
+import pytest
+
+import fusion_gym
+from fusion_gym import seeds
+from fusion_gym.envs.registration import ENVIRONMENTS
+from fusion_gym.envs.returns import TUNED, ReturnRow, read_returns
+from fusion_gym.evaluation.episodes import run_episodes
+
+KINDS = {"random", "always", "never", *TUNED, "PPO"}
+
+
+def rows_of(env_id: str) -> dict[str, ReturnRow]:
+    return {row.kind: row for row in read_returns() if row.environment == env_id}
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_the_threshold_of_an_environment_is_what_its_tuned_rule_returns(env_id: str) -> None:
+    if not env_id.startswith("fusion_gym/"):
+        pytest.skip("another test registered it")
+    rows = rows_of(env_id)
+    assert rows.keys() - {"bound"} == KINDS
+    threshold = gymnasium.spec(env_id).reward_threshold
+    assert threshold == max(rows[kind].mean for kind in TUNED)
+    assert threshold > max(rows[kind].mean for kind in ("random", "always", "never"))
+    bound = rows.get("bound")
+    assert bound is None or all(row.mean - row.half_width <= bound.mean for row in rows.values())
+
+
+@pytest.mark.parametrize("kind", ["always", "best threshold"])
+@pytest.mark.parametrize("env_id", [name for name in ENVIRONMENTS if "fusion_gym/" in name])
+def test_a_rule_returns_what_the_table_says(env_id: str, kind: str) -> None:
+    """In the first 40 of its episodes, to what their mean allows."""
+    row, task = rows_of(env_id)[kind], fusion_gym.make_task(env_id)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the windows of a recording repeat
+        policy = fusion_gym.make_policy(row.policy, task)
+        returns = run_episodes(task, policy, 40, seeds.TEST.start).returns
+    assert returns.mean() == pytest.approx(row.mean, abs=4.5 * returns.std() / 40**0.5)
+
+
+def test_an_environment_of_a_user_has_no_threshold() -> None:
+    spec = gymnasium.spec("fusion_gym/LinearFusion-v2")
+    assert spec.reward_threshold is not None
+    fusion_gym.register("mine/Returns-v0", ENVIRONMENTS["fusion_gym/LinearFusion-v2"])
+    try:
+        assert gymnasium.spec("mine/Returns-v0").reward_threshold is None
+    finally:
+        ENVIRONMENTS.pop("mine/Returns-v0")
+        gymnasium.registry.pop("mine/Returns-v0")
