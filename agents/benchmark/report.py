@@ -169,20 +169,20 @@ def headline_text(settings: Sequence[Setting], results: Results) -> str:
         knows = f"{setting.trigger_title}, {TITLES[setting.headline]}"
         cells.append((setting.title, knows, *savings, points))
     medians = (
-        float(np.median([r.saving for r in results.savings if r.kind == kind] or [np.nan]))
-        for kind in kinds
+        100.0 * float(np.median([r.saving for r in results.savings if r.kind == kind] or [np.nan]))
+        for kind in kinds[:4]
     )
-    printed, thresholds, rule, informed, _, _ = (f"{100.0 * abs(own):.0f}" for own in medians)
+    printed, thresholds, rule, informed = medians
     gains = [-row.difference for row in results.classes if row.kind == "learned"]
     every = [row for row in results.trainings if row.kind == "agent"]
     text = (
         "Cost saved against the setting's own trigger, whose parameters are tuned with as many "
         "episodes as the searched rule: % with a 95 % bootstrap interval over seeds and episodes, "
         "the mean over five prices in the class of what the trigger knows.\n\n"
-        f"In the median setting the parameters as printed cost {printed} % more than tuned ones; "
-        f"at equal knowledge a threshold for each sensor saves {thresholds} % of the tuned "
-        f"trigger's cost and the searched rule {rule} %, which becomes {informed} % if one "
-        "scheduler sees the measurements of all sensors. A learned policy costs "
+        f"In the median setting the parameters as printed cost {-printed:.0f} % more than tuned "
+        f"ones; at equal knowledge a threshold for each sensor saves {thresholds:.0f} % of the "
+        f"tuned trigger's cost and the searched rule {rule:.0f} %, which becomes {informed:.0f} % "
+        "if one scheduler sees the measurements of all sensors. A learned policy costs "
         f"{100.0 * float(np.median(gains or [np.nan])):.1f} % less than the best tuned rule in the "
         f"median of {len(gains)} classes, at most {100.0 * max(gains, default=np.nan):.1f} %; at "
         f"{sum(row.rule_points for row in every)} of {len(every) * shares} points it is that rule."
