@@ -202,7 +202,6 @@ def rows(folder: str) -> Iterator[tuple[str, str, dict[int, Workload]]]:
         kinds: dict[str, Callable[[str, Options, int], Workload]] = {
             "NumPy": partial(interface, backend="numpy"),
             "compiled": partial(interface, backend="compiled"),
-            f"JAX ({device})": partial(interface, backend="jax"),
             f"JAX ({device}), scan": scan,
             "SB3 `VecEnv`, compiled": sb3,
         }

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -18,6 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fusion_gym.core.access import channel_requests
+from fusion_gym.core.jax_setup import jax
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
@@ -28,15 +30,9 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.vector import step_infos
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.errors import refusal
-from fusion_gym.importing import require
 from fusion_gym.systems.tobit.system import CensoredEstimator
 
-require("an environment under JAX", "jax", "jax")
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-from jax.custom_batching import custom_vmap  # noqa: E402
-
-from fusion_gym.core.jitted import refuse_in_forks, register_state  # noqa: E402
+jnp = jax.numpy
 
 
 class EnvParams(NamedTuple):
@@ -84,7 +80,8 @@ class FunctionalEnv:
     """
 
     def __init__(self, task: Task) -> None:
-        self.task = task = dataclasses.replace(task, backend="jax")
+        task.refuse_jax()
+        self.task = task
         self.__setstate__({})
         estimator = task.estimator
         self._memory, self._layout = Memory(task, "scheduler"), ObservationLayout(task)
@@ -109,7 +106,7 @@ class FunctionalEnv:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         channels = self.task.plant.start_channels + self.task.network.start_channels
-        register_state(start_of(self.task, np.zeros((channels, 1)))[0])
+        _register_state(start_of(self.task, np.zeros((channels, 1)))[0])
 
     @property
     def name(self) -> str:
@@ -309,6 +306,35 @@ class FunctionalEnv:
         return dataclasses.replace(self.task, estimator=estimator.with_model(**changed))
 
 
+def _register_state(state: Any) -> None:
+    """Register the dataclasses of states with JAX, through tuples and dataclasses."""
+    if isinstance(state, tuple):
+        for part in state:
+            _register_state(part)
+    elif dataclasses.is_dataclass(state):
+        names = [field.name for field in dataclasses.fields(state)]
+        if jax.tree_util.all_leaves([state]):
+            jax.tree_util.register_dataclass(type(state), names, [])
+        for name in names:
+            _register_state(getattr(state, name))
+
+
+def _refuse_in_forks(owner: type, *methods: str) -> None:
+    """Make methods raise in a fork of a process that has run JAX, whose threads are absent."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise RuntimeError(
+            "JAX may hang in a fork of a process that has run it: use the start method 'spawn'"
+        )
+
+    def forked() -> None:
+        for method in methods if jax._src.xla_bridge.backends_are_initialized() else ():
+            setattr(owner, method, refuse)
+
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=forked)
+
+
 def _normals(keys: Any, channels: int) -> Any:
     """Return standard normals (channels, N) from N keys."""
     return jax.vmap(lambda key: jax.random.normal(key, (channels,)))(keys).T
@@ -341,7 +367,7 @@ def _for_one_run(function: Callable[..., Any]) -> Callable[..., Any]:
             result = first, moved, *rest
         return result, jax.tree.map(lambda _: True, result)
 
-    mapped = custom_vmap(single)
+    mapped = jax.custom_batching.custom_vmap(single)
     mapped.def_vmap(several)
 
     def depending(params: Any, inputs: Any, state: Any) -> Any:
@@ -354,7 +380,9 @@ def _for_one_run(function: Callable[..., Any]) -> Callable[..., Any]:
     return differentiable
 
 
-refuse_in_forks(FunctionalEnv, "reset", "step", "reset_env", "step_env", "expected_step", "signals")
+_refuse_in_forks(
+    FunctionalEnv, "reset", "step", "reset_env", "step_env", "expected_step", "signals"
+)
 
 
 class FiveValueEnv(FunctionalEnv):

@@ -146,7 +146,7 @@ class EpisodeBatch(Runs):
         )
         noise = np.concatenate([_starts(source, keys, count) for source, count in sources])
         row = self.normals() if everyone else self.normals()[:, runs]
-        if task.backend == "compiled" and self._program is not None and self.reference is None:
+        if self._program is not None and self.reference is None:
             self._begin(noise, row, None if everyone else runs)
             return
         start, announcement = start_of(task, noise)
@@ -249,16 +249,11 @@ class EpisodeBatch(Runs):
 
     def _make_program(self) -> Any:
         """Return the step of the backend, ``None`` for NumPy's."""
-        parts = self.task, Memory(self.task, self.memory.owner), self.layout
-        if self.task.backend == "compiled":
-            from fusion_gym.core.compiled import make_step
-
-            return make_step(*parts)
         if self.task.backend == "numpy":
             return None
-        from fusion_gym.core.jitted import JittedStep
+        from fusion_gym.core.compiled import make_step
 
-        return JittedStep(*parts)
+        return make_step(self.task, Memory(self.task, self.memory.owner), self.layout)
 
     def _run_program(self, requests: NDArray[Any], run: int | None) -> Outcome:
         """Make both halves of a step by the backend's program."""

@@ -106,10 +106,9 @@ class CompiledStep(RowStep):
                 requests = np.zeros((self._sensors, 1), np.bool_ if flags else whole)
                 sources = [Buffer(real, self.inputs, self.width), Buffer(real, [self.noise])]
                 sources.insert(1, Buffer(np.dtype(np.int8) if flags else whole, [requests]))
-            name = "start_arrays" if kind == "start" else "step_arrays"
             self._functions[kind] = compile_function(
                 (self.runs[0], self.runs[1].owner, kind),
-                lambda jitted, *parts: getattr(jitted, name)(self, *parts),
+                self.start_arrays if kind == "start" else self.step_arrays,
                 sources,
                 [Buffer(real, self.arrays, self.width)],
             )
@@ -137,7 +136,7 @@ def compile_function(
 
     Args:
         key: What determines the function, for the cache.
-        function: A function of :mod:`fusion_gym.core.jitted` and the arrays of one run.
+        function: A function of the arrays of one run.
         sources: Memory of these arrays, each alone or all of a row.
         sinks: Memory of the results.
 
@@ -149,10 +148,10 @@ def compile_function(
 
     def source() -> str:
         require("the first start of backend='compiled'", "compiled", "jax")
-        from fusion_gym.core import jitted
+        from fusion_gym.core.jax_setup import jax
 
         try:
-            closed = jitted.jax.make_jaxpr(functools.partial(function, jitted))(*inputs)
+            closed = jax.make_jaxpr(lambda *values: function(*values))(*inputs)
         except Exception as error:  # of a user's plant, estimator or rule
             text = " ".join(f"{type(error).__name__}: {error}".split())
             raise LoweringError(f"JAX cannot trace it ({text[:200]})") from error

@@ -30,7 +30,7 @@ ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
 Action = Literal["binary", "multidiscrete", "discrete", "assignment"]
-Backend = Literal["numpy", "jax", "compiled"]
+Backend = Literal["numpy", "compiled"]
 # Options that affect the scale of the reward, besides plant and sensors.
 _SCALING = (
     "access", "slots", "discrepancy", "discrepancy_weights", "channels", "tokens", "token_rate",
@@ -161,9 +161,8 @@ class CommonOptions:
     ``"assignment"``, with that access, is ``MultiDiscrete([sensors + 1] * channels)``: each channel
     has 0 for nobody or m + 1 for sensor m, and a sensor on several uses the first."""
     backend: Backend = "numpy"
-    """Library that computes the steps. ``"jax"`` compiles the first step, in 1 to 20 seconds, and
-    is then faster than ``"numpy"`` for few runs; it needs the extra ``jax``. ``"compiled"``, the
-    fastest, needs the extra ``compiled``: LLVM compiles the step once, in at most six seconds."""
+    """Code that computes the steps. ``"compiled"``, the fastest, needs the extra ``compiled``: LLVM
+    compiles the step once, in at most six seconds."""
     reward: Literal["scalar", "vector"] = "scalar"
     """``"scalar"`` returns the sum of the reward's two terms, ``"vector"`` both terms."""
     error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"

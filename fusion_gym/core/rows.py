@@ -15,6 +15,7 @@ from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Outcome, Position, State, advance, start_of
 from fusion_gym.core.task import Task
+from fusion_gym.namespace import namespace
 
 
 class RowStep:
@@ -75,6 +76,33 @@ class RowStep:
         memory = self.runs[1].with_states({})
         memory.begin(first, announcement, measurement, np.arange(1), [0], 1)
         return memory
+
+    def begin_run(self, noise: Any, first: Any, price: Any, limit: Any) -> Branch:
+        """Return a run at the start of an episode, from noise, price and limit of steps."""
+        task, memory, layout = self.runs
+        asarray, (start, announcement) = namespace(noise).asarray, start_of(task, noise)
+        start, steps = map_arrays(asarray, start), asarray(np.zeros(len(price), np.int64))
+        position = Position(advance(task, start, first, steps), price, steps, limit)
+        position = map_arrays(asarray, position)
+        measured = (task.plant.measurement(part.plant) for part in (start, position.state))
+        memory = self.begin_memory(announcement, *measured)
+        memory.states = map_arrays(asarray, memory.states)
+        return Branch(task, memory, layout, position)
+
+    def start_arrays(self, *inputs: Any) -> list[Any]:
+        """Return the arrays of a row at the start of :meth:`begin_run`."""
+        branch = self.begin_run(*inputs)
+        moved = branch.position(), branch.memory.states
+        return [*arrays_of(moved), *self.results, branch.observe()]
+
+    def step_arrays(self, arrays: Sequence[Any], requests: Any, noise: Any) -> list[Any]:
+        """Return the arrays of a row after a step, from a position's arrays, requests and noise."""
+        values, (task, memory, layout) = iter(arrays), self.runs
+        position, states = map_arrays(lambda _: next(values), self.template)
+        branch = Branch(task, memory.with_states(states), layout, position)
+        outcome = branch.step(requests, noise)
+        moved = branch.position(), branch.memory.states
+        return [*arrays_of(moved), *outcome, *arrays_of(branch.delivered), branch.observe()]
 
     def pack(self, position: Position, memory: MemoryStates) -> Array:
         """Return the rows of a position and of the memory's states."""

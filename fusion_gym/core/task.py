@@ -76,7 +76,7 @@ class Task:
         clock: Whether the observation shows the steps left, so that an episode ends by termination.
         own_number: Whether a local sensor observes its own number.
         vector_reward: Whether the environments return the two terms of the reward.
-        backend: ``"numpy"``, or ``"jax"`` or ``"compiled"`` for steps that JAX or LLVM compiles.
+        backend: ``"numpy"``, or ``"compiled"`` for steps that LLVM compiles.
         nominal_error: Mean squared errors (n,) that scale belief entries
             (:mod:`fusion_gym.core.scale`); ``None`` uses the errors without transmissions.
         settings: The user's options, for reports.
@@ -159,8 +159,6 @@ class Task:
             raise validation.refusal("access", self.network.access, allowed, "here")
         if self.network.acknowledgement < 1.0:
             self._check_acknowledgements()
-        if self.backend == "jax":
-            self.refuse_jax()
 
     @classmethod
     def create(

@@ -98,14 +98,12 @@ class RuleLoop:
             result[:, part] = rows[horizon % 2, :, -2:].T / horizon
         return result
 
-    def _begin(
-        self, jitted: Any, start: Any, noise: Any, price: Any, limit: Any, *values: Any
-    ) -> list[Any]:
+    def _begin(self, start: Any, noise: Any, price: Any, limit: Any, *values: Any) -> list[Any]:
         """Return the arrays of a row at the start."""
-        branch = jitted.begin(self._step, start, noise, price, limit)
+        branch = self._step.begin_run(start, noise, price, limit)
         return self._arrays(branch, values, namespace(price).zeros((2, 1)))
 
-    def _advance(self, jitted: Any, arrays: list[Any], noise: Any) -> list[Any]:
+    def _advance(self, arrays: list[Any], noise: Any) -> list[Any]:
         """Return the arrays of a row after a step, from those before and noise."""
         parts, (task, memory, layout) = iter(arrays), self._step.runs
         (position, states), values, requests, sums = map_arrays(

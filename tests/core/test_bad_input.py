@@ -335,7 +335,7 @@ def test_finished_runs_must_be_reset_when_autoreset_is_disabled() -> None:
     refused(lambda: env.step(nothing), "[2]", kind=ResetNeeded)
 
 
-@pytest.mark.parametrize("backend", ["numpy", "compiled", "jax"])
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
 @pytest.mark.parametrize("kind", [int, float, object, list], ids=lambda kind: kind.__name__)
 def test_requests_of_another_kind_move_nothing(backend: str, kind: Any) -> None:
     task = make_task("fusion_gym/RemoteEstimation-v1", backend=backend)

@@ -182,7 +182,6 @@ def test_send_on_delta_without_acknowledgements_goes_by_what_it_sent() -> None:
         ("RemoteEstimation", {"channel": "perfect", "drop_probability": None}, "no packet is lost"),
         ("RemoteEstimation", {"acknowledgements": 1.2}, "acknowledgements = 1.2"),
         ("RemoteEstimation", {"acknowledgements": "some"}, "'perfect', 'none' or a number"),
-        ("RemoteEstimation", {"backend": "jax"}, "under JAX"),
         ("MarkovJumpTracking", {"filter": "imm"}, "innovation needs the packets of all"),
         (
             "RemoteEstimation",

@@ -266,7 +266,6 @@ def test_what_is_no_recording_of_the_plant_is_refused(log: str) -> None:
         ({"process_covariance": [[1.0, 1.0], [1.0, 1.0]]}, "process noise of its own"),
         ({"horizon": 2000}, "1,500 steps of the log were not fitted"),
         ({"true_process_noise": 2.0}, "the truth is the recording"),
-        ({"backend": "jax"}, "under JAX"),
         ({"fit_share": 1.0}, "fit_share = 1.0"),
         ({"log": 3}, "^log = 3 is not allowed"),
     ]

@@ -50,9 +50,9 @@ def place(step: int, end: str) -> int:
         {"filter": "kalman", "information_shares": (0.2, 0.8)},
         {"filter": "joint"},
         {"filter": "adf"},
-        {"filter": "kalman", "backend": "jax"},
+        {"filter": "kalman", "backend": "compiled"},
     ],
-    ids=["equal", "shares", "joint", "adf", "jax"],
+    ids=["equal", "shares", "joint", "adf", "compiled"],
 )
 def test_the_centre_is_the_kalman_filter_of_the_product_form(
     options: dict[str, Any], end: str
@@ -125,8 +125,8 @@ SAME: list[tuple[str, dict[str, Any]]] = [
     (TRACKING, {"noise_scale": "random"}),
     (TRACKING, {"fusion": "ci"}),
 ]
-UNDER_JAX = [
-    pytest.param(*case, False, "jax", marks=pytest.mark.slow if number > 0 else ())
+COMPILED = [
+    pytest.param(*case, False, "compiled", marks=pytest.mark.slow if number > 0 else ())
     for number, case in enumerate(SAME)
     if case[1].get("filter") != "truncated"
 ]
@@ -137,13 +137,13 @@ UNDER_NUMPY += [
 ]
 
 
-@pytest.mark.parametrize(("env_id", "options", "memory", "backend"), [*UNDER_NUMPY, *UNDER_JAX])
+@pytest.mark.parametrize(("env_id", "options", "memory", "backend"), [*UNDER_NUMPY, *COMPILED])
 def test_a_stack_of_equal_matrices_is_the_constant_plant(
     env_id: str, options: dict[str, Any], memory: bool, backend: str
 ) -> None:
     """Bitwise over 200 steps with autoresets; the last matrices differ, and are not reached.
 
-    XLA rounds CorrelatedTracking's products with constant zeros in another order.
+    LLVM rounds products with constants in another order.
     """
     common = {"horizon": 30, "memory": memory, "backend": backend} | options
     plain = fusion_gym.make_task(env_id, **common)
@@ -169,7 +169,7 @@ def test_a_stack_of_equal_matrices_is_the_constant_plant(
         return result
 
     compare: Any = partial(np.testing.assert_array_equal, strict=True)
-    if backend == "jax" and env_id == TRACKING:
+    if backend == "compiled":
         compare = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12)
     for one, other in zip(record(), record(schedule=schedule), strict=True):
         jax.tree.map(compare, one, other)

@@ -68,7 +68,6 @@ def test_the_covariance_is_the_mean_squared_error_under_a_schedule(options: dict
         ({"censoring_threshold": 0.0}, ("filter = 'hold'", "censored")),
         ({"fusion": "ci"}, ("fusion = 'ci'", "'hold'")),
         ({"memory": True, "packet": "estimate"}, ("packet", "holds values")),
-        ({"backend": "jax"}, ("filter = 'hold'", "JAX")),
     ],
 )
 def test_what_does_not_fit_is_refused(options: dict[str, Any], words: tuple[str, ...]) -> None:

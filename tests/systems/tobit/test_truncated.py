@@ -224,7 +224,6 @@ def test_the_error_is_that_of_a_particle_filter(threshold: float) -> None:
         ({"censoring_threshold": 0.0}, ("filter = 'truncated'", "censored")),
         ({"measurement_matrices": [[[1, 0], [0, 1]]]}, ("trigger", "'report_on_change'")),
         ({"filter": "kalman"}, ("trigger = 'send_on_delta'", "filter='kalman'")),
-        ({"backend": "jax"}, ("filter = 'truncated'", "JAX")),
     ],
 )
 def test_what_does_not_fit_is_refused(options: dict[str, Any], words: tuple[str, ...]) -> None:
