@@ -54,7 +54,7 @@ def fact_table(env_id: str) -> str:
         ("sensors", str(task.sensors)),
         ("states", ", ".join(f"`{name}`" for name in task.plant.state_names)),
         ("observation", f"{len(view.names)} float32 numbers"),
-        ("action", f"`{view.actions}`"),
+        ("action", f"`{view.action.space}`"),
         ("steps of an episode", str(task.horizon)),
     ]
     return table(("id", f"`{env_id}`"), rows)
@@ -111,7 +111,7 @@ def _runs(letter: str, text: str) -> bool:
             task = task_of(f"{text} {more}".strip())
             registry.make_policy(policy, task)
             if letter == "J":
-                task.refuse_jax()
+                task.refuse_numpy_only()
     except ConfigurationError:
         return False
     return True
@@ -192,7 +192,7 @@ def return_table(text: str) -> str:
         rows.append((
             f"[`{name}`](docs/{pages_of[name]})",
             f"[{paper[0]}](docs/reproduction/{paper[1]}.md)" if paper else "–",
-            f"`{make_view(task).actions}`",
+            f"`{make_view(task).action.space}`",
             "unlimited" if bucket.unlimited else f"{bucket.rate:g} per step",
             *cells,
         ))  # fmt: skip

@@ -6,11 +6,15 @@ import inspect
 import itertools
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 from fusion_gym import validation
+from fusion_gym.importing import name_of
 
 # Types that are shown by name, because their definitions are long.
 _NAMES = {name: type(name, (), {}) for name in ("ArrayLike", "Array")}
@@ -44,25 +48,46 @@ def meanings(kind: type) -> dict[str, str]:
 
 def choices(hint: Any) -> tuple[Any, ...]:
     """Return all values of a ``Literal`` or ``Annotated[str, table]`` type except ``None``."""
-    if get_origin(hint) is Annotated:
-        return tuple(hint.__metadata__[0])
+    for table in _tables(hint):
+        return tuple(table)
     parts = [part for part in _parts(hint) if part is not NoneType]
     return get_args(parts[0]) if len(parts) == 1 and get_origin(parts[0]) is Literal else ()
 
 
 def type_text(hint: Any) -> str:
     """Return a type as Python text, with all values of a ``Literal`` or a table."""
-    if get_origin(hint) is Annotated:
+    if _tables(hint):
         names = " | ".join(map(repr, choices(hint)))
         return " | ".join(names if part is str else type_text(part) for part in _parts(hint))
     if len(parts := _parts(hint)) > 1:
         return " | ".join(map(type_text, parts))
+    (hint,) = parts
     if get_origin(hint) is Literal:
         return " | ".join(map(repr, get_args(hint)))
     text = "None" if hint is NoneType else inspect.formatannotation(hint)
     return re.sub(r"[\w.]+\.(?=\w)", "", text)
 
 
+def plain_options(value: Any) -> Any:
+    """Return settings as plain lists, numbers and strings, ready for JSON."""
+    if isinstance(value, dict):
+        return {key: plain_options(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_options(entry) for entry in value]
+    if callable(value):
+        return name_of(value)
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+@dataclass(frozen=True)
+class OptionGroup:
+    """A base of options, which are checked by their declarations."""
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+MarkT = TypeVar("MarkT")
 _hints_of = functools.cache(hints)  # cached, because every options object is checked
 
 
@@ -73,23 +98,56 @@ class Mark(functools.partial[Any]):
     """
 
 
+class Scaling:
+    """A mark of an option that affects the scale of the reward, besides plant and sensors."""
+
+
+class NumpyOnly:
+    """A mark of an option of which NumPy alone runs some values.
+
+    Args:
+        *values: These values; without any, all but the default.
+    """
+
+    def __init__(self, *values: Any) -> None:
+        self.values = values
+
+
+def marked(kind: type, mark: type[MarkT]) -> dict[str, MarkT]:
+    """Return the marks of fields, from the first class that declares each: others set defaults."""
+    result: dict[str, MarkT] = {}
+    for owner in reversed(kind.__mro__):
+        for name in inspect.get_annotations(owner):
+            for entry in _metadata(_hints_of(owner).get(name)):
+                if isinstance(entry, mark):
+                    result.setdefault(name, entry)
+    return result
+
+
 def check(options: Any) -> None:
     """Check what is declared as ``Literal``, ``bool``, a name of a table, or with a mark."""
     for name, hint in _hints_of(options.__class__).items():
         value, parts = getattr(options, name), _parts(hint)
-        marks = hint.__metadata__ if get_origin(hint) is Annotated else ({},)
         if value is None and NoneType in parts:
             continue
-        for mark in marks:
-            if isinstance(mark, Mark):
-                for entry in value if isinstance(value, tuple) else (value,):
-                    mark(name, entry)
-        if not isinstance(marks[0], Mapping):
+        checks = [mark for mark in _metadata(hint) if isinstance(mark, Mark)]
+        for mark in checks:
+            for entry in value if isinstance(value, tuple) else (value,):
+                mark(name, entry)
+        if checks or not all(isinstance(table, Mapping) for table in _tables(hint)):
             continue
         if allowed := choices(hint):
             validation.choice(name, value, allowed)
         elif set(parts) <= {bool, NoneType}:
             validation.boolean(name, value)
+
+
+def _metadata(hint: Any) -> tuple[Any, ...]:
+    return hint.__metadata__ if get_origin(hint) is Annotated else ()
+
+
+def _tables(hint: Any) -> list[Any]:
+    return [table for table in _metadata(hint) if isinstance(table, Iterable)]
 
 
 def _parts(hint: Any) -> tuple[Any, ...]:

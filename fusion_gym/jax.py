@@ -18,7 +18,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from gymnasium import spaces
 
-from fusion_gym.core.access import channel_requests
 from fusion_gym.core.jax_setup import jax
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory
@@ -80,13 +79,13 @@ class FunctionalEnv:
     """
 
     def __init__(self, task: Task) -> None:
-        task.refuse_jax()
+        task.refuse_numpy_only()
         self.task = task
         self.__setstate__({})
         estimator = task.estimator
         self._memory, self._layout = Memory(task, "scheduler"), ObservationLayout(task)
         for name in ("memory", "belief_features"):
-            if value := getattr(task, name):
+            if value := getattr(task.options, name):
                 raise refusal(name, value, "the default", "in pure functions")
         self._view = SchedulerView(task)
         self._starts = task.plant.start_channels + task.network.start_channels
@@ -116,12 +115,12 @@ class FunctionalEnv:
     @property
     def num_actions(self) -> int:
         """Number of actions of a ``Discrete`` space, or of bits or channels."""
-        space = self._view.actions
+        space = self._view.action.space
         return int(space.n) if isinstance(space, spaces.Discrete) else int(space.shape[0])
 
     def action_space(self, params: EnvParams | None = None) -> Any:
         """Return the action space."""
-        return self._view.actions
+        return self._view.action.space
 
     def observation_space(self, params: EnvParams | None = None) -> spaces.Box:
         """Return the observation space (entries,) float32."""
@@ -180,7 +179,7 @@ class FunctionalEnv:
             return jax.tree.map(functools.partial(jnp.where, ended), fresh, moved)
 
         moved = jax.lax.cond(ended.any(), renew, lambda moved: moved, moved)
-        terminated = ended & task.clock
+        terminated = ended & task.options.clock
         info = step_infos(outcome) | {"final_observation": last}
         results = outcome.reward, terminated, ended & ~terminated, info
         return self._runs(task, moved).observe(), moved, results
@@ -262,17 +261,10 @@ class FunctionalEnv:
         Raises:
             ValueError: The action has another shape.
         """
-        action, shape = jnp.asarray(action), self._view.actions.shape
+        action, shape = jnp.asarray(action), self._view.action.space.shape
         if action.shape != shape:
             raise ValueError(f"action of shape {action.shape} is not allowed: it must be {shape}")
-        if self.task.action == "assignment":
-            return channel_requests(action[:, None], self.task.sensors)
-        if not isinstance(self._view.actions, spaces.Discrete):
-            return action.reshape(-1, 1).astype(np.bool_)
-        sensors = jnp.arange(self.task.sensors)[:, None]
-        if self.task.network.access == "single":
-            return action == sensors + 1
-        return (action >> sensors & 1).astype(np.bool_)
+        return self._view.action.decode(action.reshape(-1, 1))
 
     def _started(
         self, start: Any, noise: Any, uniform: Any, params: EnvParams | None

@@ -310,7 +310,7 @@ def simulate_tobit_readings(episodes: int, seed: int, settings: Settings) -> Dat
     for reading in runs.ROUND_ROBIN_READINGS:
         for limit in (5.0, 0.5):
             task = runs.reading_task(reading, censoring_threshold=-limit, censoring_upper=limit)
-            name = "always" if task.network.access == "any" else "round_robin"
+            name = "always" if task.options.access == "any" else "round_robin"
             errors = runs.squares(task, name, episodes, seed)
             roots = np.sqrt(errors.mean((1, 2)))
             far = mean_interval((roots > 10.0).astype(float))

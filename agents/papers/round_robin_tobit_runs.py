@@ -134,7 +134,7 @@ def floor(env: str, **options: Any) -> list[float]:
     matrices.
     """
     task = fusion_gym.make_task(env, filter="kalman", **(FREE | options))
-    policy = "always" if task.network.access == "any" else "round_robin"
+    policy = "always" if task.options.access == "any" else "round_robin"
     covariances = record(task, policy, 1, 0, lambda s: task.estimator.covariance(s.estimate))
     return np.sqrt(np.diagonal(covariances[..., 0], axis1=1, axis2=2)).mean(0).tolist()
 

@@ -6,13 +6,14 @@ import functools
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import linalg
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.declaration import Mark, OptionGroup, Scaling
 from fusion_gym.errors import refusal
 from fusion_gym.namespace import namespace, ndtr, ranked_sum
 
@@ -80,6 +81,33 @@ ACCESS: dict[str, AccessRow] = {
         by_channel=True,
     ),
 }
+
+
+AccessRule = Annotated[str, ACCESS]
+
+
+@dataclass(frozen=True)
+class AccessOptions(OptionGroup):
+    """The options of medium access."""
+
+    access: Annotated[AccessRule, Scaling()] = "any"
+    """Rule of medium access. ``"any"`` admits all requests, ``"single"`` the first in the queue.
+    ``"round_robin"`` admits one sensor per step in turn, ``"random"`` one at random. ``"slots"``
+    grants the first ``slots`` requests in the queue, ``"try_once_discard"`` those with the largest
+    discrepancies. With ``"collision"`` every request goes to one of ``channels`` at random, and two
+    on one are lost and paid for. ``"assignment"`` grants at most ``channels`` requests, each on a
+    channel of its own, by default the free one of the highest probability of arrival in the order
+    of the queue. With ``"single"`` the action space is ``Discrete(sensors + 1)``: 0
+    is no request, m + 1 is sensor m."""
+    slots: Annotated[int, Scaling(), Mark(validation.integer, at_least=1)] = 1
+    """Most grants in a step with ``access="slots"`` or ``"try_once_discard"``."""
+    discrepancy: Annotated[Literal["innovation", "held"], Scaling()] = "innovation"
+    """Discrepancy of ``"try_once_discard"``: of the new measurement against its expectation
+    (``"innovation"``) or the last delivered one (``"held"``)."""
+    discrepancy_weights: Annotated[ArrayLike, Scaling()] = 1.0
+    """Weights of the squared discrepancies: one number, or one per sensor."""
+    channels: Annotated[int, Scaling(), Mark(validation.integer, at_least=1)] = 1
+    """Channels of ``access="collision"`` or ``"assignment"``."""
 
 
 def check_requests(requests: NDArray[Any], channels: int) -> None:

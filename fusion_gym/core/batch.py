@@ -249,7 +249,7 @@ class EpisodeBatch(Runs):
 
     def _make_program(self) -> Any:
         """Return the step of the backend, ``None`` for NumPy's."""
-        if self.task.backend == "numpy":
+        if self.task.options.backend == "numpy":
             return None
         from fusion_gym.core.compiled import make_step
 

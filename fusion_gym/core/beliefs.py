@@ -250,7 +250,7 @@ class SchedulerBeliefs(Beliefs):
     def sent(self) -> Estimate:
         """x̂(s); with ``packet="estimate"`` it is x* for every s."""
         self.task.refuse_delay(ONE_STEP)
-        if self.task.packet == "estimate":
+        if self.task.options.packet == "estimate":
             return Estimate(*(part.repeat(self.task.sensors, axis=0) for part in self.best))
         single = self.task.estimator.single_deliveries(self._estimate)
         if single is not None:

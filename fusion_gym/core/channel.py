@@ -3,18 +3,63 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.declaration import NumpyOnly, OptionGroup, Scaling
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace, ndtr
 
 STATES = ("bad", "good")  # of a Gilbert-Elliott channel, in the order of its matrices
 InitialState = Literal["stationary", "bad", "good"]
+
+
+# Channels of each option, and the defaults of each channel.
+_CHANNELS = {
+    "drop_probability": ("independent", "gilbert_elliott"),
+    "channel_transition": ("gilbert_elliott",),
+    "initial_channel": ("gilbert_elliott",),
+    "true_drop_probability": ("independent",),
+}
+_LONGEST = 100  # steps of a delay
+_DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
+_TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
+
+
+@dataclass(frozen=True)
+class ChannelOptions(OptionGroup):
+    """The options of losses, acknowledgements and delays."""
+
+    channel: Annotated[Literal["perfect", "independent", "gilbert_elliott"], Scaling()] = "perfect"
+    """Model of losses. ``"independent"`` loses every packet with one probability,
+    ``"gilbert_elliott"`` with a probability for each channel state. The network feeds the last
+    channel states back."""
+    drop_probability: Annotated[ArrayLike | None, Scaling()] = None
+    """Probability of a loss. Independent: one number, or one per sensor, by default 0.2; with
+    ``access="assignment"`` also a matrix (sensors, channels). Gilbert-Elliott: the pair (bad,
+    good), by default (0.7, 0.2)."""
+    channel_transition: Annotated[ArrayLike | None, Scaling()] = None
+    """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel.
+    By default ((0.7, 0.3), (0.1, 0.9))."""
+    initial_channel: Annotated[InitialState, Scaling()] = "stationary"
+    """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
+    law."""
+    true_drop_probability: ArrayLike | None = None
+    """True probability of a loss of independent channels. Estimators and policies assume
+    ``drop_probability``, the default. A pair (low, high) is a range from which each episode
+    draws."""
+    acknowledgements: Annotated[Literal["perfect", "none"] | float | None, NumpyOnly()] = "perfect"
+    """Whether a sensor learns that a packet arrives or is lost: always (``"perfect"``), never
+    (``"none"``), or with a probability. Otherwise it supposes an arrival: its ``held`` and ``age``
+    are of its last packet. The scheduler always knows."""
+    delay: Annotated[ArrayLike, Scaling(), NumpyOnly()] = 0
+    """Steps from a transmission to its arrival, at most 100: a whole number, or a pair (least,
+    most) from which each packet draws uniformly. The fusion centre repeats its updates from the
+    time of a late packet on."""
 
 
 @dataclass(frozen=True)
@@ -174,3 +219,60 @@ def _probabilities(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Arra
     if np.any(result > 1.0):
         raise validation.refusal(field, value, "between 0 and 1")
     return result
+
+
+def make_channel(
+    options: ChannelOptions, sensors: int, channels: int | None = None
+) -> Channel | None:
+    """Return the channel of the options; ``None`` loses nothing.
+
+    Args:
+        options: The options.
+        sensors: Number of sensors.
+        channels: Number of channels of an assignment.
+    """
+    kind = options.channel
+    for name, kinds in _CHANNELS.items():
+        value = getattr(options, name)
+        given = value is not None and not (isinstance(value, str) and value == "stationary")
+        if given and kind not in kinds:
+            reason = f"it belongs to {' and '.join(map(repr, kinds))}"
+            raise forbidden(name, value, reason, f"with channel={kind!r}")
+    if kind == "perfect":
+        return None
+    drop = _DROP[kind] if options.drop_probability is None else options.drop_probability
+    if channels is not None:
+        shape, sensors = (sensors, channels), sensors * channels
+        if kind == "independent":  # of one link for each pair
+            drop = validation.spread("drop_probability", validation.by_row(drop, shape), shape)
+            drop = drop.ravel()
+    if kind == "independent":
+        return Channel.independent(drop, sensors, options.true_drop_probability)
+    matrix = _TRANSITION if options.channel_transition is None else options.channel_transition
+    return Channel.gilbert_elliott(matrix, drop, sensors, options.initial_channel)
+
+
+def make_acknowledgement(options: ChannelOptions) -> float:
+    """Return the probability that the sender of a packet learns whether it arrives."""
+    value, allowed = options.acknowledgements, "'perfect', 'none' or a number from 0 to 1"
+    if value is None or isinstance(value, str):
+        if (value or "none") not in (words := {"perfect": 1.0, "none": 0.0}):
+            raise validation.refusal("acknowledgements", value, allowed)
+        return words[value or "none"]
+    return validation.number("acknowledgements", value, at_least=0.0, at_most=1.0)
+
+
+def make_delay(options: ChannelOptions) -> tuple[float, ...]:
+    """Return the probabilities of a delay of 0, 1, … steps."""
+    value: Any = options.delay
+    pair = isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) > 0
+    ends = value if pair else (value, value)
+    if len(ends) == 2:
+        least, most = (
+            validation.integer("delay", end, at_least=0, at_most=_LONGEST) for end in ends
+        )
+        if least < most or not pair:
+            count = most + 1 - least
+            return (0.0,) * least + (1.0 / count,) * count
+    allowed = "a whole number, or a pair (least, most), least < most"
+    raise validation.refusal("delay", value, allowed)

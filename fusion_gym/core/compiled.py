@@ -43,7 +43,7 @@ _LOCK = threading.RLock()  # of the threads that compile
 def make_step(task: Task, *parts: Any) -> CompiledStep | None:
     """Return the compiled step, or ``None`` with a warning for a task that NumPy alone runs."""
     try:
-        task.refuse_jax()
+        task.refuse_numpy_only()
         return CompiledStep(task, *parts)
     except (ConfigurationError, LoweringError) as error:
         warnings.warn(f"backend='compiled' runs under NumPy here: {error}", stacklevel=2)

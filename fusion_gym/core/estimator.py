@@ -48,8 +48,7 @@ class Estimator(ABC, Generic[StateT]):
 
     Attributes:
         signals: Declarations of the signals that :meth:`read` returns.
-        numpy_only: Name of the option that needs ``backend="numpy"``, ``None`` if JAX runs the
-            estimator.
+        traceable: Whether JAX traces the methods, so that compiled code and JAX run them, too.
         reads_silence: Whether :meth:`update` uses ``possible`` and ``failure``.
         covariance_fields: Fields of a state that depend only on the receptions; they have one
             column for all runs while the receptions (l, 1) are equal.
@@ -72,7 +71,7 @@ class Estimator(ABC, Generic[StateT]):
     """
 
     signals: tuple[Signal, ...]
-    numpy_only: str | None = "system"
+    traceable: bool = False
     reads_silence: bool = False
     covariance_fields: tuple[str, ...] = ()
     independent_nodes: bool = False

@@ -10,13 +10,15 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.declaration import Mark, OptionGroup, Scaling
+from fusion_gym.errors import refusal
 from fusion_gym.namespace import namespace
 
 Knowledge = Literal[
@@ -40,6 +42,47 @@ _BELOW: dict[Knowledge, tuple[Knowledge, ...]] = {
     "own_memory": ("clock", "own"),
     "scheduler_memory": ("clock", "centre", "own", "scheduler", "own_memory"),
 }
+
+
+# Knowledge class of each information mode.
+INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "scheduler", "centre": "centre"}
+Feature = Literal["difference", "value"]
+FEATURES: tuple[Feature, ...] = get_args(Feature)
+
+
+@dataclass(frozen=True)
+class ObservationOptions(OptionGroup):
+    """The options of an episode's length and of an agent's observation."""
+
+    belief_features: Sequence[Feature] | bool | None = None
+    """Observation entries of the memory's estimate: ``"difference"`` from the fusion centre's
+    estimate and ``"value"`` of a transmission. ``True`` is both, the default with memory. A delay
+    excludes the value."""
+    horizon: Annotated[int, Scaling(), Mark(validation.integer, at_least=1)] = 100
+    """Steps of an episode. The open-loop error over the horizon scales reward and observation."""
+    clock: bool = False
+    """Whether the observation shows the steps left; the end of an episode is then a termination."""
+    information: Literal["sensors", "centre"] = "sensors"
+    """Content of the observation: the new measurements of all sensors (``"sensors"``), or only the
+    fusion centre's knowledge before any transmission (``"centre"``)."""
+    own_number: bool = True
+    """Whether a local sensor observes its own number. ``False`` makes sensors of one kind
+    indistinguishable to a shared policy."""
+
+    def features(self, *, memory: bool, delayed: bool) -> tuple[Feature, ...]:
+        """Return the observation entries of the memory, by default all with memory."""
+        value: Any = self.belief_features
+        if value is None:
+            usual = FEATURES[:1] if delayed else FEATURES
+            return usual if memory else ()
+        if value is True:
+            return FEATURES
+        values = (value,) if isinstance(value, str) else value
+        if not isinstance(values, Sequence):
+            raise refusal("belief_features", value, f"a list of some of {FEATURES}, or true")
+        for name in values:
+            validation.choice("belief_features", name, FEATURES)
+        return tuple(name for name in FEATURES if name in values)
 
 
 def covers(knower: Knowledge, known: Knowledge) -> bool:

@@ -60,21 +60,20 @@ class Memory:
         validation.choice("owner", owner, get_args(Owner))
         self.task, self.owner = task, owner
         own = owner == "own"
-        if own and task.packet == "estimate":
+        if own and task.options.packet == "estimate":
             why = "with local sensors, because the estimate belongs to the scheduler"
-            raise refusal("packet", task.packet, f"'measurement' {why}")
+            raise refusal("packet", task.options.packet, f"'measurement' {why}")
         if own:
             reason = "their model of the centre has only packets that arrive at once"
             task.refuse_delay(reason, "with the memory of local sensors")
         self.parts: dict[str, MemoryPart] = {}
+        broadcast = task.broadcast
         if task.memory_estimator is not None:
             if own:
-                self._add("own", task.memory_estimator, private=task.broadcast != "packets")
+                self._add("own", task.memory_estimator, private=broadcast != "packets")
             else:
                 self.parts["every"] = MemoryPart(task.memory_estimator, copies=1, private=True)
-        if own and (
-            task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
-        ):
+        if own and (broadcast == "none" or (broadcast == "estimate" and not task.feedback)):
             self._add("single", task.estimator, private=False)
         self.keeps_every = "every" in self.parts
         self.states = {}

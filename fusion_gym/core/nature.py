@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.declaration import NumpyOnly, OptionGroup
 from fusion_gym.errors import ConfigurationError, refusal
 
 # Option of each row of a departure, and the reason why an environment may refuse it.
@@ -24,6 +26,24 @@ _SHIFT = "true_threshold_shift"
 _MODEL = (1.0, 1.0, 0.0, 1.0)  # no departure
 _FACTORS = (1e-3, 1e3)
 _LARGEST_GROWTH = 1e24  # of the plant's second moment over an episode
+
+
+@dataclass(frozen=True)
+class TruthOptions(OptionGroup):
+    """The options of the departure of the truth from the model."""
+
+    true_process_noise: Annotated[ArrayLike, NumpyOnly()] = 1.0
+    """Factor of the true standard deviation of the process noise. The filters assume 1. A pair
+    (low, high) is a range from which each episode draws."""
+    true_measurement_noise: Annotated[ArrayLike, NumpyOnly()] = 1.0
+    """Factor of the true standard deviation of the measurement noise. The filters assume 1. A pair
+    (low, high) is a range from which each episode draws."""
+    true_threshold_shift: Annotated[ArrayLike, NumpyOnly()] = 0.0
+    """Shift of the true censoring limits of the sensors. The filters assume 0. A pair (low, high)
+    is a range from which each episode draws."""
+    true_transition: Annotated[ArrayLike, NumpyOnly()] = 1.0
+    """Factor c of the true motion, from x to x + c (f(x) - x). The filters assume f(x). A pair
+    (low, high) is a range from which each episode draws."""
 
 
 @dataclass(frozen=True)
@@ -44,24 +64,24 @@ class Nature:
     high: tuple[float, ...] = _MODEL
 
     @classmethod
-    def create(cls, selection: object, absent: Collection[str] = ()) -> Nature:
+    def create(cls, options: TruthOptions, absent: Collection[str] = ()) -> Nature:
         """Return the departure that the options declare.
 
         Args:
-            selection: Object with the options of ``DEPARTURES``.
+            options: The options.
             absent: Options without an effect in this environment.
 
         Raises:
             ConfigurationError: An option is neither a number nor a rising pair (low, high), a
                 factor is outside 0.001 to 1000, or an absent option departs from the model.
         """
-        pairs = [_span(name, getattr(selection, name)) for name in DEPARTURES]
+        pairs = [_span(name, getattr(options, name)) for name in DEPARTURES]
         nature = cls(*(tuple(ends) for ends in zip(*pairs, strict=True)))
         for name in nature.departing:
             if name in absent:
                 model = _MODEL[list(DEPARTURES).index(name)]
                 allowed = f"{model:g} here, because {DEPARTURES[name]}"
-                raise refusal(name, getattr(selection, name), allowed)
+                raise refusal(name, getattr(options, name), allowed)
         return nature
 
     @property

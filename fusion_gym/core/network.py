@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,17 +14,27 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import (
     ACCESS,
+    AccessOptions,
     AccessRow,
     assign,
     check_requests,
     collisions,
     first_requests,
 )
-from fusion_gym.core.channel import Channel
+from fusion_gym.core.channel import (
+    Channel,
+    ChannelOptions,
+    make_acknowledgement,
+    make_channel,
+    make_delay,
+)
 from fusion_gym.core.estimator import Reception
-from fusion_gym.core.token_bucket import Grants, Queue, TokenBucket
+from fusion_gym.core.token_bucket import BucketOptions, Grants, Queue, TokenBucket
+from fusion_gym.declaration import plain_options
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace, ndtr
+
+_MOST_CHANNELS = 64  # of an assignment to fewer sensors
 
 
 @dataclass(slots=True)
@@ -85,66 +97,89 @@ class Delivery(NamedTuple):
 
 
 @dataclass(frozen=True)
+class NetworkOptions(ChannelOptions, BucketOptions, AccessOptions):
+    """The options of medium access, tokens, losses, acknowledgements and delays."""
+
+
+@dataclass(frozen=True)
 class Network:
     """Medium access, tokens, losses and delays, with noise of its own.
 
     Args:
-        bucket: The token bucket.
-        access: Name of a rule of :mod:`fusion_gym.core.access`.
-        channel: Losses; ``None`` loses nothing.
-        delay: Probabilities of a delay of 0, 1, … steps, drawn for each packet.
-        acknowledgement: Probability that the sender of a packet learns whether it arrives;
-            otherwise it supposes that it does.
-        slots: Most grants in a step of an access rule with slots; channels of an assignment.
-        channels: Number of channels of an access rule with collisions.
-        discrepancy: ``"innovation"`` or ``"held"`` (:func:`~fusion_gym.core.access.discrepancy`).
-        weights: Weights of the discrepancies, one number or (l, 1).
+        options: The options.
+        sensors: Number of sensors.
 
     Source: M. Nourian, A. S. Leong, S. Dey and D. E. Quevedo, "An optimal transmission strategy for
     Kalman filtering over packet dropping links with imperfect acknowledgements", IEEE Trans.
     Control of Network Systems 1, 2014, for acknowledgements.
 
     Raises:
-        ConfigurationError: The rule is unknown, the probabilities do not sum to 1, or the channel
-            has another number of sensors.
+        ConfigurationError: An option is not allowed, or has no use.
 
     Example:
-        >>> from fusion_gym.core.network import Network
-        >>> from fusion_gym.core.token_bucket import TokenBucket
-        >>> network = Network(TokenBucket.create(1.0, 5.0, 2.0, 1.0, sensors=2))
-        >>> network.sensors, network.noise_channels
-        (2, 0)
+        >>> from fusion_gym.core.network import Network, NetworkOptions
+        >>> network = Network(NetworkOptions(token_rate=1.0, token_cost=1.0), sensors=2)
+        >>> network.bucket.rate, network.noise_channels
+        (1.0, 0)
     """
 
-    bucket: TokenBucket
-    access: str = "any"
-    channel: Channel | None = None
-    delay: tuple[float, ...] = (1.0,)
-    acknowledgement: float = 1.0
-    slots: int = 1
-    channels: int = 1
-    discrepancy: str = "innovation"
-    weights: Array | float = 1.0
+    options: NetworkOptions
+    sensors: int
 
     def __post_init__(self) -> None:
-        validation.choice("access", self.access, ACCESS)
-        law = validation.not_negative("delay", self.delay, (len(self.delay),))
-        if abs(law.sum() - 1.0) > 1e-9:
-            raise forbidden("delay", self.delay, "it must have probabilities that sum to 1")
-        sensors, channels = self.sensors, self._channels
-        if self.channel is not None and self.channel.drop.shape[1] != sensors * channels:
-            reason = f"it must have {channels} loss(es) for each of the {sensors} sensors"
-            raise forbidden("channel", self.channel.drop, reason)
-
-    @property
-    def sensors(self) -> int:
-        """Number of sensors."""
-        return len(self.bucket.cost)
+        options, rule = self.options, self.rule
+        for name, used in (
+            ("slots", rule.limited and not rule.by_channel and options.access != "single"),
+            ("channels", rule.contended or rule.by_channel),
+            ("discrepancy", rule.by_discrepancy),
+            ("discrepancy_weights", rule.by_discrepancy),
+        ):
+            value, default = getattr(options, name), getattr(type(options), name)
+            if not used and plain_options(value) != default:
+                where = f"with access={options.access!r}"
+                raise forbidden(name, value, "it has no use", where)
+        for name in ("slots", "channels"):
+            most = max(self.sensors, _MOST_CHANNELS) if rule.by_channel else self.sensors
+            validation.integer(name, getattr(options, name), at_least=1, at_most=most)
+        for part in ("weights", "bucket", "channel", "delay", "acknowledgement"):
+            getattr(self, part)  # which checks it
 
     @property
     def rule(self) -> AccessRow:
         """The rule of medium access."""
-        return ACCESS[self.access]
+        return ACCESS[self.options.access]
+
+    @property
+    def slots(self) -> int:
+        """Most grants in a step of a rule with slots; channels of an assignment."""
+        return self.options.channels if self.rule.by_channel else self.options.slots
+
+    @cached_property
+    def weights(self) -> Array:
+        """Weights (l, 1) of the discrepancies."""
+        weights = self.options.discrepancy_weights
+        return validation.positive("discrepancy_weights", weights, (self.sensors,))[:, None]
+
+    @cached_property
+    def bucket(self) -> TokenBucket:
+        """The token bucket."""
+        return TokenBucket(self.options, self.sensors)
+
+    @cached_property
+    def channel(self) -> Channel | None:
+        """Losses; ``None`` loses nothing."""
+        channels = self.options.channels if self.rule.by_channel else None
+        return make_channel(self.options, self.sensors, channels)
+
+    @cached_property
+    def delay(self) -> tuple[float, ...]:
+        """Probabilities of a delay of 0, 1, … steps, drawn for each packet."""
+        return make_delay(self.options)
+
+    @cached_property
+    def acknowledgement(self) -> float:
+        """Probability that a sender learns whether its packet arrives; else it supposes so."""
+        return make_acknowledgement(self.options)
 
     @property
     def start_channels(self) -> int:
@@ -189,11 +224,11 @@ class Network:
 
     @property
     def _hops(self) -> bool:
-        return self.rule.contended and self.channels > 1
+        return self.rule.contended and self.options.channels > 1
 
     @property
     def _harvests(self) -> bool:
-        return self.bucket.harvest == "bernoulli" and not self.bucket.unlimited
+        return self.bucket.draws_harvest and not self.bucket.unlimited
 
     @property
     def _drops(self) -> bool:
@@ -271,8 +306,8 @@ class Network:
         if self._reports_some:
             unreported = ndtr(next(parts)) >= self.acknowledgement
         if self._hops:
-            drawn = (ndtr(next(parts)) * self.channels).astype(np.int64)
-            frequency = namespace(drawn).minimum(drawn, self.channels - 1)
+            drawn = (ndtr(next(parts)) * self.options.channels).astype(np.int64)
+            frequency = namespace(drawn).minimum(drawn, self.options.channels - 1)
         if self._harvests:
             harvest = ndtr(next(parts)) < self.bucket.rate
         return replace(
@@ -312,7 +347,7 @@ class Network:
         left = granted if lost is None else granted & ~lost
         if self.rule.contended:
             frequency = 0 if state.frequency is None else state.frequency
-            left = left & ~collisions(granted, frequency, self.channels)
+            left = left & ~collisions(granted, frequency, self.options.channels)
         reception, due, supposed = Reception(left), state.due, None
         if self.acknowledgement < 1.0:
             unreported = True if state.unreported is None else state.unreported
@@ -382,3 +417,29 @@ class Network:
             arrival = arrival - self.channel.drop[0][:, None]
         arrival = self.delay[0] * arrival if self._longest else arrival
         return arrival.reshape(self.sensors, -1, runs)
+
+
+def warn_of_uneven_grants(network: Network) -> None:
+    """Warn if the bucket cannot pay for all sensors at once, or favours some of them."""
+    bucket, access, sensors = network.bucket, network.options.access, network.sensors
+    whole = float(bucket.cost.sum())
+    if not bucket.unlimited and not bucket.per_sensor and bucket.capacity < whole:
+        warnings.warn(
+            f"token_capacity = {bucket.capacity:g} is below {whole:g}, the cost of one packet "
+            f"of each of the {sensors} sensors: they cannot all transmit in one step",
+            stacklevel=2,
+        )
+    if access == "round_robin" and bucket.resonates:
+        warnings.warn(
+            f"token_rate = {bucket.rate:g} and token_cost = {bucket.cost.max():g} with "
+            f"access='round_robin' favour some of the {sensors} sensors if all request; "
+            "access='any' with sharing='turns' does not",
+            stacklevel=2,
+        )
+    if access in ("round_robin", "random") and bucket.favours_cheaper:
+        warnings.warn(
+            f"token_rate = {bucket.rate:g} is below token_cost, up to {bucket.cost.max():g}, "
+            f"with access={access!r}: a sensor without enough tokens loses its turn, so "
+            "dearer sensors get fewer grants; access='any' with sharing='turns' is even",
+            stacklevel=2,
+        )

@@ -96,7 +96,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         energy if bucket.per_sensor else tokens,
         *((admitted,) if task.network.rule.turn is not None else ()),
         *((queue,) if queues else ()),
-        *((left,) if task.clock else ()),
+        *((left,) if task.options.clock else ()),
         *((block,) if price.span is not None else ()),
     )
 
@@ -135,14 +135,14 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         constants={"nominal error": whole, "squared norm": task.relative_weights[:, 0]},
     )
     if owner == "own":
-        own: Any = {"knowledge": "own_memory" if task.memory else "own", "node": "own"}
+        own: Any = {"knowledge": "own_memory" if task.options.memory else "own", "node": "own"}
         each, itself = (nodes, states), (nodes, ("nobody", "itself"))
         result = {
             "difference": differences("own_difference", value=difference, labels=each, **own),
             "value": values("own_value", value=value, labels=itself, **own),
         }
     else:
-        known: Knowledge = "scheduler_memory" if task.memory else "scheduler"
+        known: Knowledge = "scheduler_memory" if task.options.memory else "scheduler"
 
         def scheduler_values(beliefs: Beliefs) -> Array:
             silent, sent = value(beliefs).swapaxes(0, 1)

@@ -27,8 +27,7 @@ class Plant(ABC, Generic[StateT]):
     Attributes:
         state_names: Names of the n states.
         nature: Departure of the truth from the model.
-        numpy_only: Name of the option that needs ``backend="numpy"``, ``None`` if JAX runs the
-            plant.
+        traceable: Whether JAX traces the methods, so that compiled code and JAX run them, too.
         censored_beyond: Lowest and highest uncensored value of a state, by its number, for
             pictures.
 
@@ -44,7 +43,7 @@ class Plant(ABC, Generic[StateT]):
 
     state_names: tuple[str, ...]
     nature: Nature = AS_ASSUMED
-    numpy_only: str | None = "system"
+    traceable: bool = False
     censored_beyond: Mapping[int, tuple[float, float]] = _NOTHING
 
     @property

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, get_args
+from functools import cached_property
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import ErrorKind
+from fusion_gym.declaration import Mark, OptionGroup
 from fusion_gym.errors import forbidden
 from fusion_gym.importing import import_named, name_of
 from fusion_gym.namespace import namespace
 from fusion_gym.validation import ConfigurationError
 
+ErrorKind = Literal["squared", "trace", "maximum"]
 Cost = Callable[[Array, Array], Any]  # of errors (n, N) and covariances (n, n, N)
 ERROR_KINDS: tuple[str, ...] = get_args(ErrorKind)
 TRAINING_ERRORS = ("squared", "excess", "mismatch")
@@ -29,6 +31,41 @@ def equal_weights(open_loop: Array) -> Array:
     if np.any(open_loop <= 0.0):
         raise _at_rest(open_loop)
     return 1.0 / (len(open_loop) * open_loop)
+
+
+def reward_weights(
+    options: RewardOptions, state_weights: ArrayLike | None, open_loop: Array
+) -> Array:
+    """Return the checked weights (n,) of the states' squared errors.
+
+    Args:
+        options: Options with a number or ``None`` as ``reward_scale``.
+        state_weights: Weights if the options have none; ``None`` weighs all states equally so that
+            open loop costs 1.
+        open_loop: Mean error variance (n,) of each state without any transmission.
+
+    Raises:
+        ConfigurationError: A weight is negative or has a wrong shape, or the open-loop cost exceeds
+            the limit.
+    """
+    weights = state_weights if options.state_weights is None else options.state_weights
+    if options.reward_scale is not None:
+        factor = validation.number("reward_scale", options.reward_scale, above=0.0)
+        ratios = np.ones(()) if weights is None else weights
+        weights = factor * validation.not_negative("state_weights", ratios, open_loop.shape)
+    if weights is None:
+        if not open_loop.sum() > 0.0:
+            raise _at_rest(open_loop)
+        weights = np.full(open_loop.shape, 1.0 / open_loop.sum())
+    result = validation.not_negative("state_weights", weights, open_loop.shape)
+    weight = options.error_weight
+    if not weight * (result @ open_loop) <= _LARGEST:
+        raise ConfigurationError(
+            f"error_weight = {weight:g} is not allowed with state_weights = "
+            f"{validation.display(result)}: without transmissions the error may cost up to "
+            f"{_LARGEST:g} a step, not {weight * (result @ open_loop):g}"
+        )
+    return result
 
 
 def _at_rest(open_loop: Array) -> ConfigurationError:
@@ -77,68 +114,89 @@ def _own_cost(function: Cost, name: str, error: Array, covariance: Array) -> Arr
 
 
 @dataclass(frozen=True)
+class RewardOptions(OptionGroup):
+    """The options of the reward."""
+
+    reward: Literal["scalar", "vector"] = "scalar"
+    """``"scalar"`` returns the sum of the reward's two terms, ``"vector"`` both terms."""
+    error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"
+    """Error term of the reward: ``"squared"`` is Σ w_i e_i², ``"trace"`` is Σ w_i P_ii of the
+    claimed covariance P (which a policy can exploit), ``"maximum"`` is max w_i e_i². Otherwise a
+    function of errors and covariances, or its ``"module:name"``."""
+    error_weight: Annotated[float, Mark(validation.number, at_least=0.0)] = 1.0
+    """Weight of the reward's error term."""
+    cost_weight: float | Literal["random"] = 0.5
+    """Price of a token in the reward. ``"random"`` draws it from ``price_range`` for each episode,
+    uniformly in its logarithm."""
+    price_range: ArrayLike | Literal["auto"] | None = None
+    """Pair (low, high) of prices, which adds the price to the observation. ``"auto"`` simulates
+    rules without a delay: it takes the prices at which the best value of information with memory
+    sends 60 and 12 % of the sustained rate, but at least two packets per sensor and episode."""
+    state_weights: ArrayLike | None = None
+    """Weights of the states' squared errors in the reward. The default is the environment's own,
+    which ``help`` shows. Explicit weights also weigh the trace that covariance intersection
+    minimises, which is plain by default."""
+    reward_scale: float | Literal["auto"] | None = "auto"
+    """Factor of the state weights. ``"auto"`` simulates requests at an even pace and takes the
+    factor with which their error costs 1 per step; explicit ``state_weights`` are not scaled. The
+    pace is half of the sustained rate, or a quarter of all packets with unlimited tokens. These
+    errors also scale the entries of ``belief_features``. ``None`` uses the error without
+    transmissions."""
+
+    def own_weights(self, states: int) -> Array | None:
+        """Return the checked ``state_weights`` (n,), or ``None`` without them."""
+        if self.state_weights is None:
+            return None
+        return validation.not_negative("state_weights", self.state_weights, (states,))
+
+
+@dataclass(frozen=True)
 class Reward:
     """reward = -(error_weight · D + price · tokens), with D the cost of the error.
 
     The error e (n, N) is the truth minus the fused estimate, P (n, n, N) its claimed covariance.
 
     Args:
+        options: The options.
+        state_weights: Weights w (n, 1).
         error: ``"squared"`` is D = Σᵢ wᵢ eᵢ², ``"maximum"`` D = maxᵢ wᵢ eᵢ², ``"trace"`` D = Σᵢ wᵢ
             Pᵢᵢ, which a policy can exploit. A function takes e and P and returns D (N,) >= 0
             without the weights w.
-        error_weight: Weight of the error term.
-        price: Price of a token.
-        state_weights: Weights w (n, 1).
     """
 
-    error: str | Cost
-    error_weight: float
-    price: Price
+    options: RewardOptions
     state_weights: Array
+    error: str | Cost
 
     @classmethod
     def create(
-        cls,
-        error: str | Cost,
-        error_weight: float,
-        price: Price,
-        state_weights: ArrayLike | None,
-        open_loop: Array,
+        cls, options: RewardOptions, state_weights: Array, error: str | Cost | None = None
     ) -> Reward:
-        """Return a reward with checked weights.
+        """Return the reward of the options.
 
         Args:
-            error: A kind, a function, or its ``module:name``.
-            error_weight: Weight of the error term.
-            price: Price of a token.
-            state_weights: Weights (n,); ``None`` weighs all states equally so that open loop costs
-                1.
-            open_loop: Mean error variance (n,) of each state without any transmission.
+            options: The options.
+            state_weights: Weights (n,) (:func:`reward_weights`).
+            error: A kind, a function, or its ``module:name``, in place of the option.
 
         Raises:
-            ConfigurationError: The kind is unknown, the function cannot be imported, a weight is
-                negative or has a wrong shape, or the open-loop cost exceeds the limit.
+            ConfigurationError: The kind is unknown, the function cannot be imported, or the price
+                is not allowed.
         """
-        if state_weights is None and not open_loop.sum() > 0.0:
-            raise _at_rest(open_loop)
-        weights = (
-            np.full(open_loop.shape, 1.0 / open_loop.sum())
-            if state_weights is None
-            else validation.not_negative("state_weights", state_weights, open_loop.shape)
-        )
-        weight = validation.number("error_weight", error_weight, at_least=0.0)
-        if not weight * (weights @ open_loop) <= _LARGEST:
-            raise ConfigurationError(
-                f"error_weight = {weight:g} is not allowed with state_weights = "
-                f"{validation.display(weights)}: without transmissions the error may cost up to "
-                f"{_LARGEST:g} a step, not {weight * (weights @ open_loop):g}"
-            )
-        return cls(
-            error=_cost(error, len(open_loop)),
-            error_weight=weight,
-            price=price,
-            state_weights=weights[:, None],
-        )
+        cost = _cost(options.error if error is None else error, len(state_weights))
+        reward = cls(options, state_weights[:, None], cost)
+        reward.price  # noqa: B018  which checks it
+        return reward
+
+    @cached_property
+    def price(self) -> Price:
+        """Price of a token."""
+        return Price.create(self.options.cost_weight, self.options.price_range)
+
+    @property
+    def error_weight(self) -> float:
+        """Weight of the error term."""
+        return self.options.error_weight
 
     @property
     def error_kind(self) -> str:

@@ -163,7 +163,7 @@ class Runs:
         supposed, known = state.supposed, delivery.supposed
         if known is not None:
             supposed = estimator.update(supposed, Reception(known))
-        if task.packet == "estimate":
+        if task.options.packet == "estimate":
             best, spread = self.beliefs().best
             estimate = estimator.adopt(estimate, best[0], spread[0], np.asarray(arrived.any(0)))
         self.memory.update(self.beliefs, arrived if known is None else known)
@@ -397,7 +397,7 @@ def rank_requests(task: Task, state: NetworkState, known: Any) -> NetworkState:
     """Return the network's state with the order of discrepancies, if the access rule needs it."""
     if not task.network.rule.by_discrepancy:
         return state
-    size = discrepancy(task.estimator.read(known), task.network.discrepancy)
+    size = discrepancy(task.estimator.read(known), task.options.discrepancy)
     return replace(state, place=place_of(task.network.weights * size, state.queue))
 
 

@@ -16,8 +16,9 @@ from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.network import Network
-from fusion_gym.core.options import CommonOptions, Scenario, plain_options
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.task import Task
+from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, DivergenceError, display, forbidden
 
 Build = Callable[[Any], Scenario]
@@ -65,7 +66,7 @@ def rehearse(task: Task) -> None:
     """Check that runs without, with all and with alternating requests remain finite."""
     sensors = np.arange(task.sensors)
     try:
-        batch = EpisodeBatch.seeded(replace(task, backend="numpy"), 3, seed=0)
+        batch = EpisodeBatch.seeded(task.with_options(backend="numpy"), 3, seed=0)
         for step in range(min(_TRIAL, task.horizon)):
             batch.observe()
             requests = np.stack([sensors < 0, sensors >= 0, (sensors + step) % 2 == 0], axis=-1)
@@ -94,7 +95,7 @@ def _packets(network: Network) -> Array:
     if rule.turn is not None or rule.limited:
         packets = network.slots
     elif rule.contended:
-        packets = min(network.channels, packets)
+        packets = min(network.options.channels, packets)
     most = packets / network.sensors
     paid = np.inf if bucket.unlimited else bucket.rate / bucket.round_cost
     result: Array = np.minimum(most, paid)
@@ -196,7 +197,7 @@ def _above(left: int, middle: int, right: int, rate: Array, error: Array) -> boo
 
 def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
     """Return a batch of ``copies`` copies of the simulation's runs."""
-    batch = EpisodeBatch(replace(task, horizon=min(task.horizon, _STEPS)), runs * copies)
+    batch = EpisodeBatch(task.with_options(horizon=min(task.horizon, _STEPS)), runs * copies)
     batch.seed(np.arange(runs * copies), [*seeds.SCALE[:runs]] * copies)
     batch.reset()
     return batch

@@ -5,21 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, NamedTuple, get_args
+from functools import cached_property
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import Budget, Harvest, SharingRule
-from fusion_gym.errors import forbidden
+from fusion_gym.declaration import OptionGroup, Scaling
+from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.namespace import namespace, ranked_sum
-from fusion_gym.validation import ConfigurationError
 
-SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
-BUDGETS: tuple[str, ...] = get_args(Budget)
-HARVESTS: tuple[str, ...] = get_args(Harvest)
+Tokens = Literal["limited", "unlimited"]
+SharingRule = Literal["equal", "fixed", "turns"]
+Budget = Literal["shared", "sensor"]
+Harvest = Literal["constant", "bernoulli"]
 Queue = NDArray[np.int64]
 _ROUNDING = 1e-9  # tokens: ten times 0.1 pays for a transmission that costs 1
 _FEW = 16  # sensors up to which pairwise comparison is faster than sorting
@@ -43,109 +44,138 @@ class Grants(NamedTuple):
 
 
 @dataclass(frozen=True)
+class BucketOptions(OptionGroup):
+    """The options of the token bucket."""
+
+    tokens: Annotated[Tokens, Scaling()] = "limited"
+    """``"limited"`` applies the token bucket. ``"unlimited"`` grants every request and counts the
+    tokens spent."""
+    budget: Annotated[Budget, Scaling()] = "shared"
+    """``"shared"`` is one bucket for all sensors. With ``"sensor"`` each sensor has a bucket of its
+    own, such as a battery; ``token_rate``, ``token_capacity`` and ``initial_tokens`` are then one
+    number, or one per sensor."""
+    harvest: Annotated[Harvest, Scaling()] = "constant"
+    """Tokens that a bucket gains per step: ``token_rate`` (``"constant"``), or with
+    ``budget="sensor"`` one token with the probability ``token_rate`` (``"bernoulli"``)."""
+    token_rate: Annotated[ArrayLike, Scaling()] = 5.0
+    """Tokens g that the bucket gains per step (tobit_token_bucket, equation (17))."""
+    token_capacity: Annotated[ArrayLike, Scaling()] = 30.0
+    """Largest number b of tokens in the bucket (tobit_token_bucket, equation (17))."""
+    initial_tokens: Annotated[ArrayLike, Scaling()] = 10.0
+    """Tokens ξ₀ at the start of an episode."""
+    token_cost: Annotated[ArrayLike, Scaling()] = 3.0
+    """Tokens c that a transmission costs: one number, or one per sensor."""
+    sharing: Annotated[SharingRule, Scaling()] = "turns"
+    """Rule by which simultaneous requests share the tokens. ``"equal"`` grants if ξ/l ≥ c for l
+    sensors (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
+    sensors while tokens last. ``"turns"`` grants in the order of a queue: a granted sensor goes to
+    its end, and a head that the tokens do not pay for blocks the sensors behind it."""
+
+
+@dataclass(frozen=True)
 class TokenBucket:
     """Tokens accrue at ``rate`` per step up to ``capacity``; a grant to sensor m costs c_m.
 
-    Under every rule a granted sensor goes to the end of the queue, several in their order.
+    Under every rule of ``sharing`` a granted sensor goes to the end of the queue, several in their
+    order. Under ``"equal"`` each of the l sensors owns ξ/l of the tokens ξ before this step's
+    spending, and a request is granted if ξ/l >= c_m (tobit_token_bucket, equations (16) and (18)).
+    Under ``"turns"``, of two sensors with equal requests, neither gets more than one grant more
+    than the other in any window. With a bucket for each sensor a request is granted if its tokens
+    are at least c_m, and rate, capacity and initial tokens are (sensors, 1). Unlimited tokens stay
+    full, and tokens spent are counted.
 
     Args:
-        rate: Tokens per step; with a bucket for each sensor (sensors, 1), as the next two.
-        capacity: Largest number of tokens.
-        initial: Tokens at the start of an episode.
-        cost: Tokens c (sensors, 1).
-        sharing: ``"equal"``: each of the l sensors owns ξ/l of the tokens ξ before this step's
-            spending, and a request is granted if ξ/l >= c_m (tobit_token_bucket, equations (16) and
-            (18)). ``"fixed"``: requests are granted in the order of the sensors while tokens last.
-            ``"turns"``: the order is a queue, whose head blocks the others if the tokens do not pay
-            for it; of two sensors with equal requests, neither gets more than one grant more than
-            the other in any window.
-        unlimited: Whether every request is granted; tokens spent are counted, the level stays full.
-        budget: ``"shared"`` is one bucket. With ``"sensor"`` each sensor has a bucket of its own,
-            and a request is granted if its tokens are at least c_m.
-        harvest: ``"constant"`` adds ``rate`` tokens. ``"bernoulli"`` adds one token to a sensor's
-            bucket with the probability ``rate``.
+        options: The options.
+        sensors: Number of sensors.
+
+    Raises:
+        ConfigurationError: A number is not allowed, or the capacity is below the cost of a packet.
 
     Source: A. Nayyar, T. Basar, D. Teneketzis and V. V. Veeravalli, "Optimal strategies for
     communication and remote estimation with an energy harvesting sensor", IEEE Trans. Automatic
     Control 58, 2013, for ``budget="sensor"``.
     """
 
-    rate: Array | float
-    capacity: Array | float
-    initial: Array | float
-    cost: Array
-    sharing: str = "equal"
-    unlimited: bool = False
-    budget: str = "shared"
-    harvest: str = "constant"
+    options: BucketOptions
+    sensors: int
 
-    @classmethod
-    def create(
-        cls,
-        rate: ArrayLike,
-        capacity: ArrayLike,
-        initial: ArrayLike,
-        cost: ArrayLike,
-        sensors: int,
-        sharing: str = "equal",
-        unlimited: bool = False,
-        budget: str = "shared",
-        harvest: str = "constant",
-    ) -> TokenBucket:
-        """Return a bucket with checked numbers; ``cost`` is one number or one per sensor.
-
-        With ``budget="sensor"`` so are ``rate``, ``capacity`` and ``initial``.
-        """
-        each = validation.choice("budget", budget, BUDGETS) == "sensor"
-        drawn = validation.choice("harvest", harvest, HARVESTS) == "bernoulli"
-        if drawn and not each:
-            raise validation.refusal("harvest", harvest, "'constant'", f"with budget={budget!r}")
-
-        def numbers(name: str, value: Any, **limits: float | None) -> Array | float:
-            if not each:
-                return validation.number(name, value, **limits)
-            entries = validation.spread(name, value, (sensors,)).tolist()
-            return np.array([[validation.number(name, entry, **limits)] for entry in entries])
-
-        costs = validation.positive("token_cost", cost, (sensors,))[:, None]
-        limit = numbers("token_capacity", capacity, above=0.0)
-        rule = validation.choice("sharing", sharing, SHARING_RULES)
-        if each and rule != "equal":
-            raise forbidden("sharing", sharing, "it has no use", "with budget='sensor'")
-        if each and np.any(limit < costs) and not unlimited:
-            raise validation.refusal("token_capacity", capacity, "at least a sensor's token_cost")
-        needed = float(costs.max()) * (sensors if rule == "equal" else 1)
-        if not each and limit < needed * (1.0 - 1e-12) and not unlimited:
+    def __post_init__(self) -> None:
+        options, costs, limit, start = self.options, self.cost, self.capacity, self.initial
+        if self.draws_harvest and not self.per_sensor:
+            where = f"with budget={options.budget!r}"
+            raise refusal("harvest", options.harvest, "'constant'", where)
+        if self.per_sensor and options.sharing != type(options).sharing:
+            raise forbidden("sharing", options.sharing, "it has no use", "with budget='sensor'")
+        if self.per_sensor and np.any(limit < costs) and not self.unlimited:
+            allowed = "at least a sensor's token_cost"
+            raise refusal("token_capacity", options.token_capacity, allowed)
+        sensors, equal = self.sensors, self.sharing == "equal"
+        needed = float(costs.max()) * (sensors if equal else 1)
+        if not self.per_sensor and limit < needed * (1.0 - 1e-12) and not self.unlimited:
             reason = (
                 f"at least {needed:g}: under sharing='equal' each of the {sensors} sensors owns "
                 f"1/{sensors} of the bucket and a transmission costs up to {costs.max():g}"
-                if rule == "equal"
+                if equal
                 else f"at least the cost of a transmission, {needed:g}"
             )
             raise ConfigurationError(
                 f"token_capacity = {limit:g} is not allowed: with token_cost = "
-                f"{validation.display(cost)} it must be {reason}"
+                f"{validation.display(options.token_cost)} it must be {reason}"
             )
-        start = numbers("initial_tokens", initial, at_least=0.0)
         if np.any(start > limit):
-            most = validation.display(capacity) if each else f"{limit:g}"
+            each = self.per_sensor
+            most = validation.display(options.token_capacity) if each else f"{limit:g}"
             reason = f"with token_capacity = {most} it must be >= 0 and <= {most}"
-            raise forbidden("initial_tokens", initial if each else start, reason)
-        return cls(
-            rate=numbers("token_rate", rate, at_least=0.0, at_most=1.0 if drawn else None),
-            capacity=limit,
-            initial=start,
-            cost=costs,
-            sharing=rule,
-            unlimited=validation.boolean("unlimited", unlimited),
-            budget=budget,
-            harvest=harvest,
-        )
+            raise forbidden("initial_tokens", options.initial_tokens if each else start, reason)
+        self._numbers("token_rate", at_least=0.0, at_most=1.0 if self.draws_harvest else None)
+
+    def _numbers(self, name: str, **limits: float | None) -> Array | float:
+        """Return the checked numbers of an option: one, or (sensors, 1) of each sensor's bucket."""
+        value = getattr(self.options, name)
+        if not self.per_sensor:
+            return validation.number(name, value, **limits)
+        entries = validation.spread(name, value, (self.sensors,)).tolist()
+        return np.array([[validation.number(name, entry, **limits)] for entry in entries])
+
+    @cached_property
+    def cost(self) -> Array:
+        """Tokens c (sensors, 1) of a transmission."""
+        return validation.positive("token_cost", self.options.token_cost, (self.sensors,))[:, None]
+
+    @cached_property
+    def rate(self) -> Array | float:
+        """Tokens per step."""
+        return self._numbers("token_rate")
+
+    @cached_property
+    def capacity(self) -> Array | float:
+        """Largest number of tokens."""
+        return self._numbers("token_capacity", above=0.0)
+
+    @cached_property
+    def initial(self) -> Array | float:
+        """Tokens at the start of an episode."""
+        return self._numbers("initial_tokens", at_least=0.0)
+
+    @property
+    def unlimited(self) -> bool:
+        """Whether every request is granted."""
+        return self.options.tokens == "unlimited"
 
     @property
     def per_sensor(self) -> bool:
         """Whether each sensor has a bucket of its own."""
-        return self.budget == "sensor"
+        return self.options.budget == "sensor"
+
+    @property
+    def draws_harvest(self) -> bool:
+        """Whether a bucket gains one token with the probability ``rate``."""
+        return self.options.harvest == "bernoulli"
+
+    @property
+    def sharing(self) -> str:
+        """Rule of sharing; sensors with their own buckets share nothing, as under ``"equal"``."""
+        return "equal" if self.per_sensor else self.options.sharing
 
     @property
     def round_cost(self) -> Array:

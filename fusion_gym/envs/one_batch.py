@@ -9,7 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from fusion_gym.core.options import plain_options
+from fusion_gym.declaration import plain_options
 from fusion_gym.envs.privileged import make_sb3_vec_env
 from fusion_gym.envs.registration import base_of
 from fusion_gym.envs.sb3 import FusionSB3VecEnv

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fusion_gym.core.options import CommonOptions, plain_options
-from fusion_gym.declaration import choices, hints, meanings, type_text
+from fusion_gym.core.options import CommonOptions
+from fusion_gym.declaration import choices, hints, meanings, plain_options, type_text
 
 
 class Option(NamedTuple):

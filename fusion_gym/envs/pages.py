@@ -1,20 +1,18 @@
 """An environment's page and its tables, from the declarations of options, blocks and spaces."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
-from fusion_gym.core.communication import FEATURES
-from fusion_gym.core.knowledge import Block, covers, numbered
+from fusion_gym.core.action import space_text
+from fusion_gym.core.knowledge import FEATURES, Block, covers, numbered
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import belief_blocks, block_entries, network_blocks
 from fusion_gym.core.options import CommonOptions
-from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import list_options, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
-from fusion_gym.envs.views import is_received, make_view, space_text
+from fusion_gym.envs.views import is_received, make_view
 
 LEGEND = """\
 A star marks entries that only the sensors know; `information="centre"` omits them. The third column
@@ -36,14 +34,6 @@ _BELIEFS: dict[Owner, str] = {
     "own": "only with `memory=True` or `belief_features`, for local sensors",
 }
 _SEES = {"own": "its own", "broadcast": "all", "hidden": "none"}
-_ACTIONS = {
-    "single": "0 is no request, m requests sensor m - 1",
-    "binary": "A 1 requests the sensor",
-    "multidiscrete": "A 1 requests the sensor",
-    "discrete": "The number has a bit for each sensor, the lowest bit for sensor 0",
-    "assignment": "The number of each channel is 0 for nobody, m for sensor m - 1",
-}
-
 _QUEUE = ", sensors share limited tokens in turns"
 _SECOND = f"v1: covariances may be singular{_QUEUE}; counters generate the noise."
 
@@ -68,8 +58,8 @@ def page(env_id: str, task: Task | None = None) -> str:
     weights = task.reward.state_weights[:, 0]
     return _PAGE.read_text(encoding="utf-8").format(
         description="\n\n".join(text for text in description if not re.match(r"v\d+: ", text)),
-        actions=space_text(view.actions),
-        action=_ACTIONS["single" if task.network.access == "single" else task.action],
+        actions=space_text(view.action.space),
+        action=view.action.meaning,
         entries=len(view.names),
         sensors=task.sensors,
         states=", ".join(plant.state_names),
@@ -95,18 +85,30 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     for name, other in others:
         for block in other.estimator.observation:
             rows.setdefault(block.name, _row(other, block, f"only with {name}"))
-    with_memory = replace(task, memory=True, belief_features=task.belief_features or FEATURES)
+    features = task.belief_features or FEATURES
+    with_memory = task.with_options(
+        memory=True, belief_features=features, information="sensors", delay=0
+    )
     for owner, condition in _BELIEFS.items():
         for block in belief_blocks(with_memory, owner):
             visible = bool(task.belief_features) and owner == "scheduler"
             rows[block.name] = _row(task, block, "" if visible else condition)
     always = [block.name for block in network_blocks(task)]
-    price = replace(task.reward, price=Price(None, (0.01, 1.0)))
-    access = task.network.access if task.network.rule.by_channel else "round_robin"
-    turns = replace(task.network.bucket, sharing="turns", unlimited=False)
-    for bucket in (turns, replace(turns, budget="sensor")):
-        network = replace(task.network, access=access, bucket=bucket)
-        every = replace(task, network=network, clock=True, reward=price)
+    usual = type(task.options)
+    unused = ("slots", "channels", "discrepancy", "discrepancy_weights")
+    access = {name: getattr(usual, name) for name in unused} | {"access": "round_robin"}
+    if task.network.rule.by_channel:
+        access = {}
+    for bucket in ({"sharing": "turns"}, {"budget": "sensor", "sharing": usual.sharing}):
+        every = task.with_options(
+            **access,
+            **bucket,
+            tokens="limited",
+            token_capacity=1e6,
+            clock=True,
+            cost_weight="random",
+            price_range=(0.01, 1.0),
+        )
         for block in network_blocks(every):
             condition = "" if block.name in always else _NETWORK[block.name]
             rows[block.name] = _row(task, block, condition)

@@ -62,7 +62,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self.possible_agents = [f"sensor_{sensor}" for sensor in range(task.sensors)]
         self.agents: list[str] = []
         self.observation_spaces = dict.fromkeys(self.possible_agents, self.view.space)
-        self.action_spaces = dict.fromkeys(self.possible_agents, self.view.actions)
+        self.action_spaces = dict.fromkeys(self.possible_agents, self.view.action.space)
 
     def observation_space(self, agent: str) -> Box:
         """Return the Box (entries,), float32, which is the same for every agent."""
@@ -110,7 +110,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
                 f"action of each of {self.agents}"
             )
         selection = [actions[agent] for agent in self.agents]
-        outcome = self.batch.step(self.view.requests(selection, None))
+        outcome = self.batch.step(self.view.action.requests(selection, None))
         reward, ended = float(outcome.reward[0]), bool(outcome.ended[0])
         agents = self.agents
         costs = outcome.granted[:, 0] * self.task.network.bucket.cost[:, 0]
@@ -121,8 +121,8 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         result = (
             self._observations(),
             dict.fromkeys(agents, reward),
-            dict.fromkeys(agents, ended and self.task.clock),
-            dict.fromkeys(agents, ended and not self.task.clock),
+            dict.fromkeys(agents, ended and self.task.options.clock),
+            dict.fromkeys(agents, ended and not self.task.options.clock),
             infos,
         )
         if ended:

@@ -79,7 +79,7 @@ class FusionSB3VecEnv(VecEnv):
         self.totals = (0.0, 0)
         self.requests = (0, 0)
         self.render_mode = None
-        super().__init__(num_envs * self._rows, self.view.space, self.view.actions)
+        super().__init__(num_envs * self._rows, self.view.space, self.view.action.space)
         self._actions: Any = None
         self._returns = np.zeros(num_envs)
         self._spent = np.zeros(num_envs)
@@ -120,7 +120,7 @@ class FusionSB3VecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Make one step in every run with the stored actions."""
         began = time.perf_counter()
-        requests = self.view.requests(self._actions, self.runs)
+        requests = self.view.action.requests(self._actions, self.runs)
         lengths, scale = self.batch.steps, self._scale()
         outcome = self._advance(requests)
         self._returns += outcome.reward
@@ -163,7 +163,7 @@ class FusionSB3VecEnv(VecEnv):
             for row in range(run * self._rows, (run + 1) * self._rows):
                 infos[row] = {
                     "terminal_observation": final[row],
-                    "TimeLimit.truncated": not self.task.clock,
+                    "TimeLimit.truncated": not self.task.options.clock,
                     "episode": {
                         "r": float(self._returns[run]),
                         "l": int(lengths[run]) + 1,
@@ -199,7 +199,7 @@ class FusionSB3VecEnv(VecEnv):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the choices (N, choices), bool, that the network can grant as a single request."""
-        return self.view.masks(self.batch.grantable())
+        return self.view.action.masks(self.batch.grantable())
 
     def close(self) -> None:
         """Do nothing, because there are no resources to release."""

@@ -62,8 +62,8 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
         self.view = SchedulerView(task)
         self.observation_names = self.view.names
         self.observation_space = self.view.space
-        self.action_space = self.view.actions
-        if task.vector_reward:
+        self.action_space = self.view.action.space
+        if task.options.reward == "vector":
             self.reward_space = vector.reward_space()
 
     def reset(
@@ -112,15 +112,15 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
         """
         if self.batch.finished[0]:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
-        outcome = self.batch.step(self.view.requests(action, None), 0)
+        outcome = self.batch.step(self.view.action.requests(action, None), 0)
         if self._film is not None:
             self._film.record(self.batch, Outcome._make(part[..., None].copy() for part in outcome))
             self._show()
         observation = self.batch.observe()[0]
         infos = vector.step_infos(outcome)
-        ended, clock = bool(outcome.ended), self.task.clock
+        ended, clock = bool(outcome.ended), self.task.options.clock
         reward: Any = vector.rewards_of(self.task, outcome)
-        if not self.task.vector_reward:
+        if self.task.options.reward != "vector":
             reward = float(reward)
         return observation, reward, ended and clock, ended and not clock, infos
 
@@ -141,7 +141,7 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the allowed choices (choices,), bool, as sb3-contrib's MaskablePPO reads them."""
-        return self.view.masks(self.batch.grantable())[0]
+        return self.view.action.masks(self.batch.grantable())[0]
 
 
 def _steps_singly() -> bool:

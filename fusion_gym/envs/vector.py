@@ -99,10 +99,10 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         self.view = SchedulerView(task)
         self.observation_names = self.view.names
         self.single_observation_space = self.view.space
-        self.single_action_space = self.view.actions
+        self.single_action_space = self.view.action.space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        if task.vector_reward:
+        if task.options.reward == "vector":
             self.reward_space = reward_space()
         self._film = None if self.render_mode is None else Film(task, self.num_envs)
         self._everyone = np.ones(self.num_envs, dtype=np.bool_)
@@ -196,7 +196,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         if not self._started.all():
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         batch = self.batch
-        requests = self.view.requests(actions, self.num_envs)
+        requests = self.view.action.requests(actions, self.num_envs)
         finished = batch.finished
         if self.autoreset_mode == AutoresetMode.DISABLED and finished.any():
             raise gymnasium.error.ResetNeeded(
@@ -219,13 +219,13 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
             self._renew(ended)
             infos = _cleared(infos, ended)
         never = np.zeros_like(ended)
-        terminated, truncated = (ended, never) if self.task.clock else (never, ended)
+        terminated, truncated = (ended, never) if self.task.options.clock else (never, ended)
         infos = _with_mask(infos, self._everyone) | final
         return batch.observe(), reward, terminated, truncated, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the choices (N, choices), bool, that the network can grant as a single request."""
-        return self.view.masks(self.batch.grantable())
+        return self.view.action.masks(self.batch.grantable())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Return the result of ``action_masks`` or ``render``, or an attribute, once per run."""
@@ -273,14 +273,14 @@ def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MOD
 
 def rewards_of(task: Task, outcome: Outcome) -> NDArray[np.float64]:
     """Return the rewards (N,) of a step, or (N, 2) with error term and token term."""
-    if not task.vector_reward:
+    if task.options.reward != "vector":
         return outcome.reward
     return np.stack([outcome.reward_error, outcome.reward_communication], axis=-1)
 
 
 def refuse_vector_reward(task: Task, where: str) -> None:
     """Raise a ``ConfigurationError`` if the task's reward is a vector."""
-    if task.vector_reward:
+    if task.options.reward == "vector":
         raise validation.refusal("reward", "vector", "'scalar'", where)
 
 

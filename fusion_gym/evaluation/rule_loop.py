@@ -135,7 +135,7 @@ def make_loop(task: Task, rule: Any, sizes: Mapping[str, int], run_steps: int) -
     if run_steps < _FEWEST or foreign or not rule.stateless:
         return None
     try:
-        task.refuse_jax()
+        task.refuse_numpy_only()
         return RuleLoop(task, rule, sizes)
     except (ConfigurationError, LoweringError):
         return None

@@ -294,7 +294,7 @@ def class_of(task: Task, local: bool) -> ClassName:
     """Return the class of the agents of a task; ``local`` ones decide at each sensor."""
     if local:
         return "local"
-    return "centre" if task.information == "centre" else "scheduler"
+    return "centre" if task.options.information == "centre" else "scheduler"
 
 
 def search_of_class(

@@ -68,7 +68,7 @@ def owner_of(policy: Policy) -> Owner | None:
 def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     """Return the signals outside a policy's declared knowledge, with the reason of each refusal."""
     knower = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # no declaration: all signals
-    if not task.memory and covers(knower, "own"):
+    if not task.options.memory and covers(knower, "own"):
         knower = least_covering((knower, "own_memory"))  # beliefs use only the new measurements
     every = (*task.estimator.signals, *MEMORY_SIGNALS, *NETWORK_SIGNALS, *PLANNING_SIGNALS)
     least = {signal.name: signal for signal in every}

@@ -41,16 +41,16 @@ class BeliefRule(Rule):
 
 def knows(task: Task, own: bool) -> Knowledge:
     """Return the knowledge class of a rule on beliefs, in a task with or without memory."""
-    if task.memory:
+    if task.options.memory:
         return "own_memory" if own else "scheduler_memory"
     return "own" if own else "scheduler"
 
 
 def check_owner(task: Task, own: bool, **only_together: Any) -> None:
     """Check that a task shows the measurements, and with ``own`` allows local decisions."""
-    if task.information != "sensors":
+    if task.options.information != "sensors":
         allowed = "'sensors', because it reads new measurements"
-        raise refusal("information", task.information, allowed, "with this rule")
+        raise refusal("information", task.options.information, allowed, "with this rule")
     if not own:
         return
     SensorView(task)  # refuses tasks without local decisions

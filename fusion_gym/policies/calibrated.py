@@ -142,11 +142,8 @@ class CalibratedPolicy(Stateless):
             logits /= np.array(self.slopes)[:, None, None]
             own = np.take_along_axis(logits, agent[None, None], 0)[0]
             score += (1.0 - mixture) * np.where(mixture < 1.0, own, 0.0)
-        requests: Requests = score >= threshold
-        if self.task.network.access == "single":  # an agent names one sensor, the rule any
-            best = score.argmax(0) == np.arange(len(score))[:, None]
-            requests &= best | (mixture == 1.0)
-        return requests
+        requests = self.task.action.choose(score, threshold)  # the rule names any sensors
+        return requests | ((score >= threshold) & (mixture == 1.0))
 
 
 def save_calibrated(

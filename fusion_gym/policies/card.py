@@ -23,10 +23,11 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.dqn.policies import DQNPolicy
 
 from fusion_gym import validation
+from fusion_gym.core.action import space_text
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
-from fusion_gym.envs.views import make_view, space_text
+from fusion_gym.envs.views import make_view
 from fusion_gym.policies.archive import NeedsTrust
 from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError, display
@@ -105,8 +106,7 @@ class ModelView:
             allowed = f"{display(self.price_range)}, which the agent observes, or left out"
             raise validation.refusal("price_range", span, allowed)
         if self.price_range is not None and span is None:
-            price = Price(None, self.price_range)
-            task = replace(task, reward=replace(task.reward, price=price))
+            task = task.with_options(cost_weight="random", price_range=self.price_range)
         error, own = self.nominal_error, task.nominal_error
         if own is None or not task.belief_features or self.observation_names is None:
             return task

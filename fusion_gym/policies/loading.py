@@ -5,7 +5,6 @@ Stable-Baselines3 in the place of the card. Nothing in the file is unpickled. Wi
 loader of Stable-Baselines3 loads the file and runs code that it contains.
 """
 
-import dataclasses
 import pickle
 from collections.abc import Mapping
 from contextlib import suppress
@@ -18,8 +17,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from fusion_gym import validation
-from fusion_gym.core.task import ACTION_KINDS, Task
-from fusion_gym.envs.views import View, make_view, space_text
+from fusion_gym.core.action import ACTIONS, space_text
+from fusion_gym.core.task import Task
+from fusion_gym.envs.views import View, make_view
 from fusion_gym.policies import card
 from fusion_gym.policies.archive import NeedsTrust, read_plain, read_weights
 from fusion_gym.policies.model import ModelPolicy
@@ -69,7 +69,7 @@ def load_model_policy(
         ) from None
     except ConfigurationError as error:
         raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
-    task = dataclasses.replace(task, action=action)
+    task = task.with_options(action=action)
     policy = ModelPolicy(model, task, deterministic, price, observed)
     if normalize is not None:
         policy.normalization = _statistics(normalize, policy.view, trust)
@@ -116,7 +116,7 @@ def _rebuilt(
     kind: Any = card.ALGORITHMS[blueprint.algorithm]
     base = card.POLICIES[blueprint.algorithm]
     model = kind(base, env=None, device="cpu", _init_setup_model=False)
-    model.observation_space, model.action_space = view.space, view.actions
+    model.observation_space, model.action_space = view.space, view.action.space
     model.policy = _policy(blueprint, network, view)
     try:
         model.policy.load_state_dict(weights, strict=True)
@@ -135,7 +135,7 @@ def _policy(blueprint: card.Blueprint, network: NetworkShape, view: View) -> Any
     with torch.random.fork_rng(devices=[]):
         return kind(
             view.space,
-            view.actions,
+            view.action.space,
             lr_schedule=lambda _: 0.0,
             activation_fn=card.ACTIVATIONS[blueprint.activation],
             optimizer_class=lambda *_, **__: None,
@@ -183,21 +183,23 @@ def _fitted(
         missing = [name for name in names if name not in view.names]
         extra = [name for name in view.names if name not in names]
         raise ConfigurationError(
-            f"{trained} {len(names)} entries, the task (information={task.information!r}) has "
-            f"{len(view.names)}; missing are {missing[:4] or 'none'}, unknown to the model "
+            f"{trained} {len(names)} entries, the task (information={task.options.information!r}) "
+            f"has {len(view.names)}; missing are {missing[:4] or 'none'}, unknown to the model "
             f"{extra[:4] or 'none'}" + ("" if missing or extra else " (the order differs)")
         )
     if shape != view.space.shape:
         raise ConfigurationError(
-            f"{trained} shape {shape}, the task (information={task.information!r}) has "
+            f"{trained} shape {shape}, the task (information={task.options.information!r}) has "
             f"{view.space.shape}"
         )
-    allowed = {space_text(view.actions): (task.action, view)}
-    if not observed.local and task.network.access != "single":
-        for kind in ACTION_KINDS:
+    allowed: dict[str, tuple[str, View]] = {
+        space_text(view.action.space): (task.options.action, view)
+    }
+    if not observed.local and task.options.access != "single":
+        for kind in ACTIONS:
             with suppress(ConfigurationError):  # the kind "discrete" of many sensors
-                other = make_view(dataclasses.replace(task, action=kind))
-                allowed[space_text(other.actions)] = (kind, other)
+                other = make_view(task.with_options(action=kind))
+                allowed[space_text(other.action.space)] = (kind, other)
     if actions not in allowed:
         raise ConfigurationError(
             f"it has the action space {actions!r}: the task has {task.sensors} sensors, so it must "

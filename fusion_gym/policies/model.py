@@ -93,7 +93,7 @@ class ModelPolicy:
         """Return the requests (sensors, N)."""
         masks = {}
         if isinstance(self.model, MaskablePPO):
-            masks["action_masks"] = self.view.masks(signals["grantable"])
+            masks["action_masks"] = self.view.action.masks(signals["grantable"])
         action, self._memory = self.model.predict(
             self.rows(signals),
             state=self._memory,
@@ -101,7 +101,7 @@ class ModelPolicy:
             deterministic=self.deterministic,
             **masks,
         )
-        return self.view.requests(action, len(signals["start"]))
+        return self.view.action.requests(action, len(signals["start"]))
 
     def rows(self, signals: Signals) -> Rows:
         """Return the observation of the model (N·rows_per_run, entries), float32."""
@@ -121,30 +121,28 @@ class ModelPolicy:
     @property
     def pairs(self) -> bool:
         """Whether each bit of an action has two outputs of the network, silence and a request."""
-        multiple = isinstance(self.view.actions, spaces.MultiDiscrete)
+        multiple = isinstance(self.view.action.space, spaces.MultiDiscrete)
         return multiple or isinstance(self.model, MaskablePPO)
 
     def check_logits(self) -> None:
         """Refuse an agent without one logit for each sensor."""
-        actions, model = self.view.actions, self.model
+        action, model = self.view.action, self.model
         if isinstance(model, RecurrentPPO) or not hasattr(model.policy, "action_net"):
             allowed = "an agent with one logit for each sensor (ppo, a2c, trpo, maskable_ppo)"
             raise refusal("policy", type(model).__name__, allowed)
-        together = isinstance(actions, spaces.Discrete) and self.view.rows_per_run == 1
-        together = together and self.task.network.access != "single"
-        if together or self.task.action == "assignment":
-            raise refusal("action", str(actions), "MultiBinary, MultiDiscrete, or access='single'")
+        if action.places(0) is None:
+            allowed = "MultiBinary, MultiDiscrete, or access='single'"
+            raise refusal("action", str(action.space), allowed)
 
     def logits(self, signals: Signals) -> Array:
         """Return the logit (sensors, N) of each sensor's request over its silence."""
         policy: Any = self.model.policy
-        rows, places = torch.as_tensor(self.rows(signals)), self._requests()
+        rows = torch.as_tensor(self.rows(signals))
         with torch.no_grad():
             latent = policy.mlp_extractor.forward_actor(policy.extract_features(rows))
             outputs: Array = policy.action_net(latent).numpy().astype(np.float64)
-        silence = np.delete(outputs, places, axis=1)
-        result = outputs[:, places] - (silence if silence.size else 0.0)
-        result = result.reshape(-1, self.task.sensors).T
+        result = self.view.action.scores(outputs)
+        assert result is not None  # or check_logits refuses
         masked = isinstance(self.model, MaskablePPO)
         return np.where(signals["grantable"], result, -np.inf) if masked else result
 
@@ -153,11 +151,6 @@ class ModelPolicy:
         result = copy.deepcopy(self)
         policy: Any = result.model.policy
         with torch.no_grad():
-            policy.action_net.bias[self._requests()] -= threshold
+            bias = policy.action_net.bias
+            bias[self.view.action.places(len(bias))] -= threshold
         return result
-
-    def _requests(self) -> slice:
-        """Return the places of requests in the outputs of the network; the others are silence."""
-        if isinstance(self.view.actions, spaces.Discrete):
-            return slice(1, None)
-        return slice(1, None, 2) if self.pairs else slice(None)

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from fusion_gym.core.action import space_text
 from fusion_gym.core.knowledge import MEANING, Block, numbered
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.options import plain_options
+from fusion_gym.declaration import plain_options
 from fusion_gym.entries import Plain
-from fusion_gym.envs.views import SensorView, space_text
+from fusion_gym.envs.views import SensorView
 from fusion_gym.policies.card import algorithm_name
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes
@@ -45,7 +46,7 @@ def onnx_card(
     names = list(graph.entries)
     visible = {name.partition("[")[0] for name in names}
     blocks = [_block(block, local) for block in layout.blocks if block.name in visible]
-    if local and task.own_number:
+    if local and task.options.own_number:
         number = Block("sensor", "number of the sensor", np.array, (numbered(task.sensors),))
         blocks.append(_block(number, local))
     price = task.reward.price.span
@@ -57,9 +58,9 @@ def onnx_card(
         "observation_high": graph.high.tolist(),
         "observation_blocks": blocks,
         "action": {
-            "space": space_text(agent.view.actions),
+            "space": space_text(agent.view.action.space),
             "sensors": task.sensors,
-            "access": task.network.access,
+            "access": task.options.access,
             "choices": None if graph.choices is None else graph.choices.tolist(),
         },
         "options": task.settings,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.dqn.policies import DQNPolicy
@@ -50,9 +51,10 @@ class DecisionGraph(torch.nn.Module):
         if not agent.deterministic:
             allowed = "True; the graph also returns the probability of every request"
             raise refusal("deterministic", False, allowed, "here")
-        if agent.task.action == "assignment":
+        action = agent.view.action
+        if not action.bits and not isinstance(action.space, spaces.Discrete):
             allowed = "another kind, because the graph requests without channels"
-            raise refusal("action", agent.task.action, allowed, "here")
+            raise refusal("action", agent.task.options.action, allowed, "here")
         if not isinstance(policy, tuple(POLICIES.values())):
             raise ConfigurationError(
                 f"policy {type(policy).__name__} is not allowed here: it must be a policy of "
@@ -159,13 +161,10 @@ class DecisionGraph(torch.nn.Module):
 
 def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
     """Return the requests (choices, k) int8 of each discrete action; None for bits."""
-    view = agent.view
-    number = getattr(view.actions, "n", None)
-    if len(view.actions.shape or ()) or number is None:
+    action = agent.view.action
+    if not isinstance(action.space, spaces.Discrete):
         return None
-    if view.rows_per_run > 1:
-        return np.array([[0], [1]], dtype=np.int8)
-    return np.ascontiguousarray(view.requests(np.arange(number), int(number)).T).astype(np.int8)
+    return (np.eye(2, 1, -1) if agent.view.local else action.table).astype(np.int8)
 
 
 def save_graph(graph: DecisionGraph, path: Path, received: Mapping[str, str]) -> None:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge, Signals
-from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import PRICE, Requests, Stateless, check_at_most, strongest
 from fusion_gym.solvers.single import solve_average
@@ -54,8 +53,7 @@ class OptimalPolicy(Stateless):
 
     def __init__(self, task: Task, criterion: str = "finite", price: float | None = None) -> None:
         if price is not None:
-            reward = replace(task.reward, price=Price.create(price))
-            task = replace(task, reward=reward)
+            task = task.with_options(cost_weight=price, price_range=None)
         self.optimum = solve_task(task, criterion)
 
     @property
@@ -161,7 +159,7 @@ class WhittleIndex(Stateless):
     def __init__(self, task: Task, price: float | None = None, at_most: int | None = None) -> None:
         check_at_most("at_most", at_most)
         problems = source_problems(task)
-        self._at_most = 1 if at_most is None and task.network.access == "single" else at_most
+        self._at_most = 1 if at_most is None and task.options.access == "single" else at_most
         fixed = task.reward.price.fixed if price is None else price
         self.price = validation.number("price", fixed, at_least=0.0)
         self._cost = task.network.bucket.cost

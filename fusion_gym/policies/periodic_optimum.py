@@ -97,10 +97,10 @@ class PeriodicOptimum(Stateless):
         validation.integer("period", period, at_least=1, at_most=validation.MOST_STEPS)
         validation.integer("packets", packets, at_least=1, at_most=period * task.sensors)
         validation.choice("average", average, AVERAGES)
-        if task.network.access != "any":
+        if task.options.access != "any":
             where = "with policy 'periodic_optimum'"
             allowed = "'any', because the search grants every request"
-            raise validation.refusal("access", task.network.access, allowed, where)
+            raise validation.refusal("access", task.options.access, allowed, where)
         _cycle(task)
         count = math.comb(period * task.sensors, packets)
         if count > _MOST:

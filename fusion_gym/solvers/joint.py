@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.core.token_bucket import BucketOptions, TokenBucket
 from fusion_gym.errors import forbidden
 from fusion_gym.solvers.single import iterate_values
 from fusion_gym.solvers.source import ErrorGrid, Resolution, SourceProblem, TokenLevels
@@ -49,7 +49,7 @@ class JointProblem:
             reason = "the channel must lose packets independently"
             raise forbidden("channel", "gilbert_elliott", reason, "for the joint optimum")
         if bucket is None:
-            bucket = TokenBucket.create(1.0, 2.0, 2.0, 1.0, sensors=2, unlimited=True)
+            bucket = TokenBucket(BucketOptions(tokens="unlimited"), sensors=2)
         limit = validation.integer("at_most", at_most, at_least=1, at_most=2)
         return cls((first, second), TokenLevels.create(bucket), limit)
 

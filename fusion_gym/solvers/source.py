@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.core.token_bucket import BucketOptions, TokenBucket
 
 _MOST_POINTS = 1500
 
@@ -198,7 +198,7 @@ class SourceProblem:
         if np.any(loss > 1.0):
             raise validation.refusal("drop", loss, "at most 1 everywhere")
         if bucket is None:
-            bucket = TokenBucket.create(1.0, 1.0, 1.0, 1.0, sensors=1, unlimited=True)
+            bucket = TokenBucket(BucketOptions(tokens="unlimited"), sensors=1)
         return cls(
             coefficient=validation.number("coefficient", coefficient),
             deviation=validation.number("deviation", deviation, above=0.0),

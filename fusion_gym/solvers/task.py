@@ -57,7 +57,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     task.refuse_delay("the optimum supposes arrivals in the step of a request")
     if task.network.rule.by_channel:
         where = "for the optimum"
-        raise validation.refusal("access", task.network.access, "without an assignment", where)
+        raise validation.refusal("access", task.options.access, "without an assignment", where)
     if task.network.acknowledgement < 1.0:
         value, allowed = task.settings.get("acknowledgements"), "'perfect'"
         raise validation.refusal("acknowledgements", value, allowed, "for the optimum")
@@ -104,7 +104,7 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
     validation.choice("criterion", criterion, CRITERIA)
     problems, bucket = source_problems(task), task.network.bucket
     single = len(problems) == 1
-    if not single and not (task.network.access == "any" and bucket.unlimited):
+    if not single and not (task.options.access == "any" and bucket.unlimited):
         return _solve_pair(task, problems, criterion)
     # Several independent sources have unlimited tokens, of one level.
     tokens = TokenLevels.create(bucket) if single else problems[0].tokens
@@ -135,10 +135,10 @@ def _solve_pair(task: Task, problems: tuple[SourceProblem, ...], criterion: str)
     if len(problems) != 2:
         where = "for the optimum under limited tokens or access"
         raise validation.refusal("sensors", len(problems), "1 or 2", where)
-    if task.network.access not in ("any", "single"):
+    if task.options.access not in ("any", "single"):
         where = "for the optimum of two sources"
-        raise validation.refusal("access", task.network.access, "'any' or 'single'", where)
-    at_most = 1 if task.network.access == "single" else 2
+        raise validation.refusal("access", task.options.access, "'any' or 'single'", where)
+    at_most = 1 if task.options.access == "single" else 2
     problem = JointProblem.create(problems, task.network.bucket, at_most)
     if criterion == "average":
         stationary = solve_joint_average(problem)

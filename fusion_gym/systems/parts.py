@@ -71,7 +71,7 @@ class SensorPlant(Plant[StateT]):
 
     dynamics: Any
     sensors: Any
-    numpy_only = None
+    traceable = True
 
     @property
     def sensor_count(self) -> int:
@@ -117,7 +117,7 @@ class ScaledEstimator(Estimator[StateT]):
     state_weights: Array
     magnitude: Array
     reference: Array
-    numpy_only = None
+    traceable = True
 
     def trace(self, covariance: Array) -> Array:
         """Return the weighted trace (N,) of a covariance (n, n, N)."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import plain_options
+from fusion_gym.declaration import plain_options
 from fusion_gym.errors import refusal
 from fusion_gym.gaussian import interval_moments
 from fusion_gym.linalg import TOLERANCE

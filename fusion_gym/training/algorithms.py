@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from fusion_gym.core.task import ACTION_KINDS
+from fusion_gym.core.action import ACTIONS
 from fusion_gym.docstrings import table
 from fusion_gym.entries import Arguments
 from fusion_gym.importing import import_named
@@ -139,7 +139,7 @@ class Algorithm:
     meaning: str
     source: str
     policy: str = "MlpPolicy"
-    actions: tuple[str, ...] = ACTION_KINDS
+    actions: tuple[str, ...] = tuple(ACTIONS)
 
     @property
     def model(self) -> Any:

@@ -22,9 +22,8 @@ from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.access import channel_requests
+from fusion_gym.core.action import Sets
 from fusion_gym.envs.privileged import PrivilegedVecEnv
-from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError, refusal
 
 _CLOSED = -1e8  # the logit of a masked choice
@@ -367,56 +366,44 @@ class Decisions:
     """
 
     def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
-        self.view, self.local = env.view, isinstance(env.view, SensorView)
-        self.sensors, self.runs = env.task.sensors, env.runs
-        space = env.action_space
-        self.assigns = env.task.action == "assignment"
-        self.binary = not isinstance(space, Discrete) and not self.assigns
-        if self.local or self.assigns:
-            self.kind: Kind = "flips"
-        elif not self.binary:
-            self.kind = "all"
-        else:
+        self.view, self.local, action = env.view, env.view.local, env.view.action
+        self.sensors, self.runs, self.action = env.task.sensors, env.runs, action
+        self.binary, assigns = action.bits and not self.local, action.factors[0] > 1
+        self.kind: Kind = "flips" if self.local or assigns else "all"
+        if self.binary:
             few = self.sensors < 60 and 2**self.sensors <= MOST_ALTERNATIVES
             self.kind = kind or ("all" if few else "flips")
-        form = "assigns channels" if self.assigns else "is one number"
         if kind is not None and kind != self.kind:
+            form = "assigns channels" if assigns else "is one number"
             why = "sensors decide locally" if self.local else f"an action {form}"
             raise refusal("alternatives", kind, f"{self.kind!r}, because {why}", "here")
-        self.choices = self.sensors + 1 if self.assigns else 2
-        if self.kind == "all":
-            self.choices = 2**self.sensors if self.binary else int(space.n)  # type: ignore[attr-defined]
-            if self.choices > 2**MOST_SENSORS:
-                text, instead = "action = 'discrete'", "action must be 'binary'"
-                if self.binary:
-                    text, instead = "alternatives = 'all'", "it must be 'flips'"
-                raise ConfigurationError(
-                    f"{text} is not allowed here with {self.sensors} sensors: it steps all "
-                    f"2^{self.sensors} sets of requests of at most {MOST_SENSORS} sensors; "
-                    f"{instead}"
-                )
-            numbers = np.arange(self.choices)
-            bits = (numbers[:, None] >> np.arange(self.sensors) & 1).astype(np.bool_)
-            actions = bits if self.binary else numbers
-            self.bits = torch.as_tensor(bits, dtype=torch.float32)
-            self.requests = env.view.requests(actions, self.choices).T[:, :, None]
+        if self.kind == "all" and self.binary:
+            self.action = Sets(self.sensors)
+        self.choices = self.action.factors[1]
+        if self.kind == "all" and self.choices > 2**MOST_SENSORS:
+            text, instead = "action = 'discrete'", "action must be 'binary'"
+            if self.binary:
+                text, instead = "alternatives = 'all'", "it must be 'flips'"
+            raise ConfigurationError(
+                f"{text} is not allowed here with {self.sensors} sensors: it steps all "
+                f"2^{self.sensors} sets of requests of at most {MOST_SENSORS} sensors; {instead}"
+            )
+        self.flips = self.kind == "flips" and action.bits
 
     def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:
         """Return the log-probabilities of all choices (runs, D, C).
 
         Args:
-            logits: for ``Discrete`` (runs, choices), for local decisions (runs, sensors, 2), for
-                bits (runs, sensors), for an assignment (runs, channels · choices).
+            logits: for bits (runs, sensors), for local decisions (runs, sensors, 2), and otherwise
+                (runs, D · C).
         """
-        if self.assigns:
-            return torch.log_softmax(logits.reshape(len(logits), -1, self.choices), -1)
         if not self.binary:
-            values = torch.log_softmax(logits, -1)
-            return values if self.local else values[:, None]
+            return torch.log_softmax(logits.reshape(len(logits), -1, self.choices), -1)
         silent = -torch.nn.functional.softplus(logits)
-        if self.kind == "flips":
+        if self.flips:
             return torch.stack((silent, logits + silent), -1)
-        return (silent.sum(-1, keepdim=True) + logits @ self.bits.T)[:, None]
+        bits = torch.as_tensor(self.action.table, dtype=torch.float32)
+        return (silent.sum(-1, keepdim=True) + logits @ bits.T)[:, None]
 
     def by_run(self, rows: Any) -> Any:
         """Return local rows (rows, entries) by run (runs, sensors, entries); others unchanged."""
@@ -428,30 +415,21 @@ class Decisions:
 
     def actions(self, choice: Choices) -> NDArray[Any]:
         """Return the actions of the rows from the choices (runs, D)."""
-        if self.assigns or (self.binary and self.kind == "flips"):
-            return choice
-        if not self.binary:
-            return choice.reshape(-1)
-        return choice >> np.arange(self.sensors) & 1
+        if self.binary and not self.flips:
+            return self.action.table[choice[:, 0]].astype(np.int64)
+        return choice.reshape(-1) if isinstance(self.view.action.space, Discrete) else choice
 
     def alternatives(self, choice: Choices) -> NDArray[Any]:
         """Return the alternative requests (A, sensors, N) of the choices (runs, D)."""
-        if self.kind == "all":
-            return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
-        if self.assigns:
-            changed = np.eye(choice.shape[1], dtype=np.bool_)[:, None, :, None]
-            each = np.where(changed, np.arange(self.choices)[:, None, None], choice.T)
-            return channel_requests(each.reshape(-1, *choice.T.shape), self.sensors)
-        taken = choice.T == 1
-        return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
+        taken, every = choice.T, np.arange(self.choices)[:, None, None]
+        changed = np.eye(len(taken), dtype=np.bool_)[:, None, :, None]
+        each = np.where(changed, 1 - taken if self.flips else every, taken)
+        return self.action.decode(each.reshape(-1, *taken.shape))
 
     def arranged(self, choice: Choices, taken: Array, stepped: Array) -> Array:
         """Return the values (runs, D, C) of all choices, from taken and stepped (A, runs) ones."""
-        if self.kind == "all":
-            return stepped.T[:, None]
-        if self.assigns:
-            return stepped.T.reshape(len(choice), -1, self.choices)
-        flipped = stepped.T
-        rest = np.broadcast_to(taken[:, None], flipped.shape)
-        request = choice == 1
-        return np.stack((np.where(request, flipped, rest), np.where(request, rest, flipped)), -1)
+        values = stepped.T
+        if not self.flips:
+            return values.reshape(*choice.shape, -1)
+        rest, request = np.broadcast_to(taken[:, None], values.shape), choice == 1
+        return np.stack((np.where(request, values, rest), np.where(request, rest, values)), -1)

@@ -5,23 +5,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
-import numpy as np
 import torch
 import yaml
-from gymnasium.spaces import Discrete
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 
 from fusion_gym import seeds
-from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments, Plain
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_estimator
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.envs.views import SensorView
 from fusion_gym.errors import forbidden
 from fusion_gym.importing import trust_files
 from fusion_gym.output import files
@@ -41,10 +37,10 @@ from fusion_gym.validation import ConfigurationError, refusal
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     """Return the training environment."""
     name, local = experiment.algorithm.name, experiment.environment.local
-    many = not local and task.network.access != "single"
-    if many and task.action not in TABLE[name].actions:
+    many = not local and task.options.access != "single"
+    if many and task.options.action not in TABLE[name].actions:
         reason = f"set the environment's option action: {' or '.join(TABLE[name].actions)}"
-        raise forbidden("action", task.action, reason, f"with algorithm {name!r}")
+        raise forbidden("action", task.options.action, reason, f"with algorithm {name!r}")
     training, where = experiment.training, experiment.environment
     runs: Arguments = {
         "num_envs": training.num_envs,
@@ -95,39 +91,13 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
     return model
 
 
-def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
-    """Return logits of the choices with which every sensor requests at ``rate``.
-
-    Args:
-        env: the training environment.
-        rate: share of the steps with a request of a sensor.
-
-    Returns:
-        Logits (sensors,) of the requests, or one per number of ``Discrete`` or of a channel.
-    """
-    odds, space, sensors = np.log(rate / (1.0 - rate)), env.action_space, env.task.sensors
-    if isinstance(env.view, SensorView):
-        return np.array([0.0, odds])
-    if env.task.network.access == "single" or env.task.action == "assignment":
-        channels = env.task.network.slots
-        share = rate / channels  # of each channel
-        if sensors * share >= 1.0:
-            allowed = f"< {channels}/{sensors}, because one of {sensors} sensors uses a channel"
-            raise refusal("initial_rate", rate, allowed)
-        return np.tile(np.log([1.0 - sensors * share, *[share] * sensors]), channels)
-    if not isinstance(space, Discrete):
-        return np.full(sensors, odds)
-    bits = np.arange(2**sensors)[:, None] >> np.arange(sensors) & 1
-    return np.asarray(bits.sum(1) * odds)
-
-
 def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
     """Shift the last layer's offsets so that the untrained policy requests at this rate."""
-    logits = initial_logits(env, rate)
+    logits = env.view.action.logits(rate)
     head = model.policy.action_net
     assert isinstance(head, torch.nn.Linear)
-    if head.out_features == 2 * logits.size:  # two choices a sensor
-        logits = np.stack((np.zeros_like(logits), logits), axis=1).ravel()
+    if logits.size == 2 * head.out_features:  # one output a sensor
+        logits = logits[1::2]
     with torch.no_grad():
         head.bias.add_(torch.as_tensor(logits, dtype=head.bias.dtype))
 

@@ -148,7 +148,7 @@ def test_the_reference_takes_in_every_measurement(name: str, local: bool) -> Non
     env_id, options = TASKS[name]
     options = {**options, "horizon": 4} | ({"information": "sensors"} if local else {})
     task = fusion_gym.make_task(env_id, **options)
-    owner: Owner | None = ("own" if local else "scheduler") if task.memory else None
+    owner: Owner | None = ("own" if local else "scheduler") if task.options.memory else None
     batch = EpisodeBatch(task, RUNS, owner, reference_estimator(env_id, options))
     plain = EpisodeBatch(task, RUNS, owner)
     free = fusion_gym.make_task(env_id, **options | {"tokens": "unlimited"})

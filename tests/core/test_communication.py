@@ -134,5 +134,9 @@ def test_nodes_receive_by_default_what_the_papers_let_them_receive(
 ) -> None:
     task: Task = fusion_gym.make_task(env_id)
     assert task.broadcast == broadcast
-    assert (task.memory, task.packet, task.memory_estimator) == (False, "measurement", None)
+    assert (task.options.memory, task.options.packet, task.memory_estimator) == (
+        False,
+        "measurement",
+        None,
+    )
     assert not EpisodeBatch(task, 1).memory.states

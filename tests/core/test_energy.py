@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from buckets import make_bucket
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +14,6 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import SignalError, Signals
 from fusion_gym.core.scale import sustained_rate, sustained_tokens
-from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.evaluation import record_episode, run_episodes
 from fusion_gym.policies.base import Rule, guard
 from fusion_gym.validation import ConfigurationError
@@ -108,7 +108,7 @@ def test_each_bucket_closes_its_own_balance(cost: list[float], seed: int, drawn:
     rate = rng.integers(0, 9, sensors) / 8
     capacity = np.array(cost) + rng.integers(0, 17, sensors) / 8
     harvest = "bernoulli" if drawn else "constant"
-    bucket = TokenBucket.create(
+    bucket = make_bucket(
         rate, capacity, 0.5 * capacity, cost, sensors, budget="sensor", harvest=harvest
     )
     tokens = bucket.start(4)

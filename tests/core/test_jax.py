@@ -240,7 +240,7 @@ UNREPORTED = {"channel": "independent", "acknowledgements": "none"}
         ("LinearFusion-v2", {"delay": 1}, "delay"),
         ("LinearFusion-v2", TRUNCATED, "filter"),
         ("RemoteEstimation-v1", UNREPORTED, "acknowledgements"),
-        ("RecordedFusion-v1", {}, "log"),
+        ("RecordedFusion-v1", {}, "plant"),
     ],
 )
 def test_what_jax_does_not_run_is_refused(name: str, options: dict[str, Any], field: str) -> None:
@@ -287,7 +287,7 @@ def test_requests_are_those_of_the_usual_interfaces(options: dict[str, Any]) -> 
     bits = [[0, 0, 1], [1, 0, 0], [1, 1, 0]]
     actions = bits if env.action_space().shape else range(env.num_actions)
     for action in actions:
-        np.testing.assert_array_equal(env.requests(action), env._view.requests(action, None))
+        np.testing.assert_array_equal(env.requests(action), env._view.action.requests(action, None))
 
 
 def test_the_earlier_interface_is_done_at_a_termination() -> None:

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.channel import Channel
 from fusion_gym.core.estimator import Reception
-from fusion_gym.core.network import Network
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import ENVIRONMENTS
@@ -192,16 +190,6 @@ def test_a_branch_takes_its_packets_under_way_along() -> None:
         for part, other in zip(branch.beliefs().best, batch.beliefs().best, strict=True):
             np.testing.assert_array_equal(part, other)
         np.testing.assert_array_equal(branch.observe(), batch.observe())
-
-
-def test_a_network_refuses_what_it_does_not_model() -> None:
-    task = make_task("LinearFusion-v2", {}, 0.2, DELAY)
-    with pytest.raises(ConfigurationError, match=r"delay = .* sum to 1"):
-        Network(task.network.bucket, delay=(0.5, 0.2))
-    with pytest.raises(ConfigurationError, match=r"channel = .* each of the 2 sensors"):
-        Network(task.network.bucket, channel=Channel.independent(0.1, 3))
-    with pytest.raises(ConfigurationError, match="access = 'each'"):
-        Network(task.network.bucket, access="each")
 
 
 def test_an_episode_begins_without_packets_of_the_last_one() -> None:

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from buckets import make_bucket
 from scalar_ages import by_age
 
 import fusion_gym
 from fusion_gym.core.task import Task
-from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
@@ -66,7 +66,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
         r"sensors = 200.*must be 1 or 2",
     ),
     "tokens": (
-        lambda: TokenLevels.create(TokenBucket.create(1.0, 13.0, 1.0, 1.0, sensors=13)),
+        lambda: TokenLevels.create(make_bucket(1.0, 13.0, 1.0, 1.0, sensors=13)),
         r"sensors = 13 .*at most 12.*2\^13",
     ),
     "ages": (

@@ -27,10 +27,10 @@ def test_masks_close_exactly_the_actions_with_closed_sensors(options: dict[str, 
     task = fusion_gym.make_task(ENV_ID, **options)
     patterns = np.array(list(product((False, True), repeat=3))).T
     view = SchedulerView(task)
-    masks = view.masks(patterns)
+    masks = view.action.masks(patterns)
     if options.get("action") == "discrete" or options.get("access") == "single":
         for action in range(masks.shape[1]):
-            selection = view.requests(np.full(8, action), 8)
+            selection = view.action.requests(np.full(8, action), 8)
             np.testing.assert_array_equal(masks[:, action], ~(selection & ~patterns).any(0))
     else:
         np.testing.assert_array_equal(masks.reshape(8, 3, 2)[..., 0], True)

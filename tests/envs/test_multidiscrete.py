@@ -78,7 +78,7 @@ def test_an_agent_of_forty_sensors_is_saved_and_loaded(
             policy: Any = make_policy(f"model:{tmp_path / 'agent.zip'}", task, trust=trust)
             actions = policy.model.predict(observation, deterministic=True)[0]
             np.testing.assert_array_equal(actions, expected)
-            assert policy.view.actions == envs.action_space
+            assert policy.view.action.space == envs.action_space
     fewer = MANY | {"measurement_matrices": MANY["measurement_matrices"][:39]}
     other = fusion_gym.make_task(LINEAR, **fewer)
     refused(lambda: make_policy(f"model:{tmp_path / 'agent.zip'}", other))
@@ -99,7 +99,7 @@ def test_every_learner_of_several_choices_trains(tmp_path: Path, kind: str) -> N
     assert run.train(experiment, quiet=True)["finished"]
     task = fusion_gym.make_task(ENV, **options)
     policy: Any = make_policy(f"model:{Path(experiment.output) / 'final_model.zip'}", task)
-    assert policy.view.actions == MultiDiscrete([2, 2, 2])
+    assert policy.view.action.space == MultiDiscrete([2, 2, 2])
     assert np.isfinite(run_episodes(task, policy, 4, 0).mse).all()
     if kind == "recurrent_ppo":
         return

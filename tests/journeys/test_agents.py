@@ -37,10 +37,10 @@ EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "\ntraining:" in f.r
 def test_committed_experiments_are_valid(path: Path) -> None:
     experiment = load_checked(Experiment, path)
     task = fusion_gym.make_task(experiment.environment.id, **experiment.environment.options)
-    if task.network.access != "single":
-        assert task.action in TABLE[experiment.algorithm.name].actions
+    if task.options.access != "single":
+        assert task.options.action in TABLE[experiment.algorithm.name].actions
     binary = "binary" in TABLE[experiment.algorithm.name].actions
-    assert (task.action == "binary") == (binary or task.network.access == "single")
+    assert (task.options.action == "binary") == (binary or task.options.access == "single")
 
 
 @pytest.mark.usefixtures("unsearched")

@@ -1,8 +1,7 @@
 """The cases of the laws: every registered environment, and the options that change its parts."""
 
 import functools
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,11 @@ from numpy.typing import NDArray
 from own_system import OWN_ID
 
 import fusion_gym
+from fusion_gym.core.access import AccessOptions
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.task import Task, make_bucket
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 
 Array = NDArray[Any]
@@ -182,12 +182,12 @@ class Case:
             more.pop("sharing", None)
         if more and more.keys() <= SCARCE.keys() | FREE.keys():
             task = self.task()
-            selection: Any = SimpleNamespace(**task.settings | more)
-            bucket = make_bucket(selection, task.sensors)
-            fixed = task.network.rule.by_channel  # its links are those of the access
-            access = task.network.access if fixed else selection.access
-            network = replace(task.network, bucket=bucket, access=access)
-            return replace(task, network=network, settings=vars(selection))
+            if task.network.rule.by_channel:  # its links are those of the access
+                more.pop("access", None)
+            elif "access" in more:
+                kind = type(task.options)
+                more = {f.name: getattr(kind, f.name) for f in fields(AccessOptions)} | more
+            return task.with_options(**more)
         return fusion_gym.make_task(self.env_id, **self.options | more)
 
     def batch(
@@ -237,14 +237,14 @@ each_id = pytest.mark.parametrize("env_id", IDS, ids=short)
 def requests(task: Task, runs: int, steps: int, rate: float = 0.4) -> NDArray[np.bool_]:
     """Random requests (steps, sensors, runs), always the same; one a step with single access."""
     request = np.random.default_rng(7).random((steps, task.sensors, runs)) < rate
-    return request & (request.cumsum(1) == 1) if task.network.access == "single" else request
+    return request & (request.cumsum(1) == 1) if task.options.access == "single" else request
 
 
 def actions(task: Task, request: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Actions (runs, …) of a scheduler for the requests (sensors, runs)."""
-    if task.network.access == "single":
+    if task.options.access == "single":
         return np.where(request.any(0), 1 + request.argmax(0), 0)
-    if task.action == "discrete":
+    if task.options.action == "discrete":
         return (request * 2 ** np.arange(task.sensors)[:, None]).sum(0)
     return request.T.astype(np.int64)
 

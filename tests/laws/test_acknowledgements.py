@@ -52,10 +52,9 @@ class OtherLosses(Network):
 
 def other(task: Task) -> Task:
     """The task with other losses."""
-    network = task.network
-    parts = network.bucket, network.access, network.channel
-    changed = OtherLosses(*parts, acknowledgement=network.acknowledgement)
-    return replace(task, network=changed)
+    result = replace(task)
+    vars(result)["network"] = OtherLosses(task.options, task.sensors)
+    return result
 
 
 @pytest.mark.parametrize("memory", [False, True])

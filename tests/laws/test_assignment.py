@@ -28,7 +28,6 @@ from fusion_gym.training.counterfactual import (
     CounterfactualPPO,
     Decisions,
 )
-from fusion_gym.training.run import initial_logits
 from fusion_gym.validation import ConfigurationError
 
 NAME, RUNS = "fusion_gym/CorrelatedTracking-v1", 5
@@ -294,10 +293,10 @@ def test_credit_of_a_channel_is_that_of_its_alternatives(options: dict[str, Any]
 
 def test_an_untrained_agent_begins_at_its_rate() -> None:
     envs = fusion_gym.make_sb3_vec_env(NAME, RUNS, **ASSIGNED)
-    shares = np.exp(initial_logits(envs, 0.3)).reshape(2, 4)
+    shares = np.exp(envs.view.action.logits(0.3)).reshape(2, 4)
     np.testing.assert_allclose(shares.sum(1), 1.0)
     np.testing.assert_allclose(shares[:, 1:], 0.15)
-    refused(lambda: initial_logits(envs, 0.7), "initial_rate = 0.7", "< 2/3")
+    refused(lambda: envs.view.action.logits(0.7), "initial_rate = 0.7", "< 2/3")
 
 
 # --- what works with it, and what does not --------------------------------------------------------

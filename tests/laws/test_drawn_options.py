@@ -52,7 +52,7 @@ def drawn(name: str) -> Iterator[tuple[Options, list[EpisodeBatch]]]:
 @pytest.mark.parametrize("name", [*NAMES, "BiasedTracking"])
 def test_drawn_options_give_the_steps_of_numpy(name: str) -> None:
     for options, batches in drawn(name):
-        rng, single = np.random.default_rng(1), batches[0].task.network.access == "single"
+        rng, single = np.random.default_rng(1), batches[0].task.options.access == "single"
         for step in range(STEPS):
             requests = rng.random((batches[0].task.sensors, RUNS)) < 0.4
             requests &= requests.cumsum(0) == 1 if single else True

@@ -52,15 +52,15 @@ def every_warning_is_an_error() -> Iterator[None]:
 
 def actions(task: Task, request: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Actions (runs, …), of which those of an assignment give two channels to two sensors."""
-    if task.action == "assignment":
+    if task.options.action == "assignment":
         return request[:2].T * np.array([3, 1])
     return usual_actions(task, request)
 
 
 def has_local_view(make: Any, case: Case) -> bool:
     """Whether sensors can decide by themselves; else ``make`` refuses it."""
-    memory = case.local_memory if case.task().memory else case.local
-    if memory and case.task().action != "assignment":
+    memory = case.local_memory if case.task().options.memory else case.local
+    if memory and case.task().options.action != "assignment":
         return True
     message = r"(information = 'centre'|delay = |action = 'assignment' .*local view)"
     with pytest.raises(ConfigurationError, match=message):
@@ -164,7 +164,7 @@ def test_agrees_with_gymnasiums_vector_of_single_environments(
         action = actions(task, request)
         mine, other = ours.step(action), theirs.step(action)
         same(mine, other)
-        over = other[2 if task.clock else 3].copy()
+        over = other[2 if task.options.clock else 3].copy()
         endings.add(tuple(over.tolist()))
         if mode is AutoresetMode.DISABLED and over.any():
             reset(None, over)
@@ -202,7 +202,7 @@ def test_stable_baselines_rows_are_the_vector_environments(case: Case) -> None:
         action = actions(task, request)
         observation, reward, done, infos = ours.step(action)
         expected, value, terminated, truncated, info = theirs.step(action)
-        over = terminated if task.clock else truncated
+        over = terminated if task.options.clock else truncated
         np.testing.assert_array_equal(observation, expected, strict=True)
         np.testing.assert_array_equal(reward, value.astype(np.float32), strict=True)
         np.testing.assert_array_equal(done, over)
@@ -214,7 +214,7 @@ def test_stable_baselines_rows_are_the_vector_environments(case: Case) -> None:
             continue
         for run in range(3):
             assert infos[run].keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
-            assert infos[run]["TimeLimit.truncated"] is not task.clock
+            assert infos[run]["TimeLimit.truncated"] is not task.options.clock
             last = info["final_obs"][run]
             np.testing.assert_array_equal(infos[run]["terminal_observation"], last, strict=True)
             episode = infos[run]["episode"]

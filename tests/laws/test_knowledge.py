@@ -102,7 +102,7 @@ def test_nothing_shown_depends_on_the_truth(case: Case, owner: Any) -> None:
     if owner == "own" and not case.local_memory:
         return
     task = case.task(**FREE)
-    other = dataclasses.replace(task, plant=OtherTruth(task.plant), backend="numpy")
+    other = dataclasses.replace(task, plant=OtherTruth(task.plant))
     batches = [EpisodeBatch.seeded(own, 3, 0, owner) for own in (task, other)]
     outcomes: list[Outcome | None] = [None, None]
     for request in requests(task, 3, STEPS):
@@ -154,7 +154,7 @@ def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
         groups += [(sensor, first, c) for c in (-1, *np.flatnonzero(single)[:2].tolist())]
     sensor, base, changed = np.array(groups).T
     others, noticed = np.arange(task.sensors)[:, None] != sensor, False
-    sent = requests(task, 1, STEPS) & others[None] & (task.packet == "measurement")
+    sent = requests(task, 1, STEPS) & others[None] & (task.options.packet == "measurement")
     for signals, runs in steps(batch, changed, sent):
         for signal in task.estimator.signals:
             value = signals[signal.name]
@@ -171,7 +171,7 @@ def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
                 apart = differs(value, base)
                 assert not (apart & others).any()
                 noticed |= bool(apart.any())
-        elif task.information == "centre":
+        elif task.options.information == "centre":
             assert not differs(runs.observe().T[None], base).any()
     assert (changed >= 0).any()
     assert noticed or view is None
@@ -311,8 +311,9 @@ class Beside:
 
     def add(self, estimator: Any, sent: Callable[[Array], Array]) -> EpisodeBatch:
         """One with this filter that gets the packets ``sent`` (sensors, N)."""
+        options = dataclasses.replace(self.task.options, memory=False, memory_filter=None)
         plain = dataclasses.replace(
-            self.task, estimator=estimator, memory=False, memory_estimator=None
+            self.task, estimator=estimator, options=options, memory_estimator=None
         )
         self.others.append((EpisodeBatch.seeded(plain, 3, 4), sent))
         return self.others[-1][0]

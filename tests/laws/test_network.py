@@ -86,8 +86,7 @@ def test_sensors_that_request_alike_are_granted_alike(env_id: str, rate: float) 
     """In every window their grants differ by at most one, by default and with one grant a step."""
     batch = Case(env_id, THREE.get(short(env_id), {})).batch(**SCARCE | {"token_rate": rate})
     for access in ("any", "single"):
-        network = dataclasses.replace(batch.task.network, access=access)
-        task = dataclasses.replace(batch.task, network=network)
+        task = batch.task.with_options(access=access)
         for name in ("always", "round_robin"):
             policy, batch = make_policy(name, task), EpisodeBatch.seeded(task, 1, 0)
             grants = np.array([batch.step(policy(batch.signals())).granted for _ in range(60)])

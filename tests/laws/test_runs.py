@@ -64,7 +64,7 @@ def test_a_run_is_the_same_by_itself_and_in_a_batch(case: Case) -> None:
         outcome = batch.step(requested)
         visible, reward, *ended, info = env.step(actions(batch.task, requested)[run])
         assert (reward, any(ended)) == (outcome.reward[run], outcome.ended[run])
-        assert ended[0] == (outcome.ended[run] and batch.task.clock)
+        assert ended[0] == (outcome.ended[run] and batch.task.options.clock)
         for name in ("cost", "granted", "squared_error", "reward_error", "diverged"):
             np.testing.assert_array_equal(info[name], getattr(outcome, name)[..., run])
         begin = outcome.ended.copy()

@@ -106,12 +106,12 @@ def test_probabilities_are_those_that_the_agent_draws_with(tmp_path: Path) -> No
         arguments = {"observation": rows[:1]}
         if "grantable" in graph.inputs:
             allowed = np.array([[True], [False], [True]])
-            masks = {"action_masks": agent.view.masks(allowed.repeat(4000, axis=1))}
+            masks = {"action_masks": agent.view.action.masks(allowed.repeat(4000, axis=1))}
             arguments["grantable"] = allowed.T
         session = onnxruntime.InferenceSession(str(tmp_path / "agent.onnx"))
         probability = session.run(["probability"], arguments)[0][0]
         action, _ = agent.model.predict(rows, deterministic=False, **masks)
-        drawn = agent.view.requests(action, 4000).mean(1)
+        drawn = agent.view.action.requests(action, 4000).mean(1)
         slack = 4.0 * np.sqrt(probability * (1.0 - probability) / 4000) + 1e-6
         assert (np.abs(drawn - probability) < slack).all()
         if masks:

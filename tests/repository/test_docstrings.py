@@ -134,7 +134,9 @@ def owner(name: str) -> Any:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_docstring_names_every_argument(name: str) -> None:
-    result, text = owner(name), inspect.getdoc(owner(name)) or ""
+    result = owner(name)
+    parts = result.__mro__ if isinstance(result, type) else (result,)  # of a base, too
+    text = "\n".join(inspect.getdoc(part) or "" for part in parts)
     described = set(re.findall(r"^ {4}\*{0,2}(\w+):", text, re.MULTILINE))
     if isinstance(result, type) and issubclass(result, CommonOptions):  # its fields have docstrings
         described = {key for key, option in options_in(result).items() if option.meaning}

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from buckets import make_bucket
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from rules import make_rule
 from scalar_ages import by_age
 from scipy.optimize import minimize_scalar
 
-from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.solvers.ages import solve_ages
@@ -167,7 +167,7 @@ def test_losses_in_the_best_schedule_by_ages() -> None:
 
 
 def test_levels_of_a_bucket() -> None:
-    bucket = TokenBucket.create(1.0, 6.0, 2.0, 3.0, sensors=1)
+    bucket = make_bucket(1.0, 6.0, 2.0, 3.0, sensors=1)
     levels = TokenLevels.create(bucket)
     assert levels.level.tolist() == [1, 2, 3, 4, 5, 6]
     assert levels.level[levels.initial] == 2.0
@@ -175,13 +175,13 @@ def test_levels_of_a_bucket() -> None:
     assert levels.level[levels.following[:, 0]].tolist() == [2, 3, 4, 5, 6, 6]
     assert levels.level[levels.following[2:, 1]].tolist() == [1, 2, 3, 4]
     assert levels.index(np.array([1.0, 2.9999999, 6.0])).tolist() == [0, 2, 5]
-    awkward = TokenBucket.create(math.sqrt(0.5), 600.0, 0.0, 1.0, sensors=1)
+    awkward = make_bucket(math.sqrt(0.5), 600.0, 0.0, 1.0, sensors=1)
     with pytest.raises(ConfigurationError, match="levels"):
         TokenLevels.create(awkward)
 
 
 def test_tokens_in_plenty_do_not_bind() -> None:
-    bucket = TokenBucket.create(1.0, 2.0, 2.0, 1.0, sensors=1)
+    bucket = make_bucket(1.0, 2.0, 2.0, 1.0, sensors=1)
     wide = solve_average(SourceProblem.create(price=5.0, bucket=bucket))
     assert wide.cost == pytest.approx(solve_average(SourceProblem.create(price=5.0)).cost, rel=1e-4)
 
@@ -319,7 +319,7 @@ def test_joint_optimum_lies_between_the_dual_bound_and_the_best_schedule(drop: f
 
 
 def test_dual_bound_of_an_episode() -> None:
-    bucket = TokenBucket.create(0.5, 4.0, 2.0, 1.0, sensors=2, sharing="fixed")
+    bucket = make_bucket(0.5, 4.0, 2.0, 1.0, sensors=2, sharing="fixed")
     sources = (SourceProblem.create(price=0.5), SourceProblem.create(price=0.5, coefficient=0.8))
     joint = solve_joint_finite(JointProblem.create(sources, bucket), 30)
     bound = lagrangian_bound(sources, (1.0, 1.0), 0.5, horizon=30, initial_tokens=2.0)
@@ -372,7 +372,7 @@ def make_problem(transition: Any, initial: Any = None) -> SourceProblem:
 
 
 PLAIN, STATES = SourceProblem.create(), published_problem(0.3, 0.1)
-BUCKET = TokenBucket.create(0.5, 2.0, 0.0, 1.0, sensors=1)
+BUCKET = make_bucket(0.5, 2.0, 0.0, 1.0, sensors=1)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_values_stand_at_the_choices_that_they_are_of(name: str) -> None:
     action = rng.integers(0, decisions.choices, (RUNS, factors))
 
     def value_of(choices: Any) -> Any:
-        return (worth * env.view.requests(decisions.actions(choices), RUNS)).sum(0)
+        return (worth * env.view.action.requests(decisions.actions(choices), RUNS)).sum(0)
 
     expected = decisions.alternatives(action)
     stepped = (worth * expected.transpose(1, 0, 2).reshape(sensors, -1)).sum(0).reshape(-1, RUNS)

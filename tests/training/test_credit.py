@@ -69,7 +69,8 @@ def test_masked_requests_have_no_probability(kind: Any) -> None:
 
     def requests(masks: torch.Tensor) -> torch.Tensor:
         values = model._decisions.log_probabilities(model._logits(observations, masks)).exp()
-        return values @ model._decisions.bits if kind == "all" else values[..., 1][:, None]
+        sets = torch.as_tensor(model._decisions.action.table, dtype=torch.float32)
+        return values @ sets if kind == "all" else values[..., 1][:, None]
 
     apart, usual = requests(masks)[:, 0].detach(), requests(torch.ones_like(masks))[:, 0].detach()
     assert (apart[::2, 1] < 1e-6).all()

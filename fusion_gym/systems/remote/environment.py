@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, Scenario, Tokens
-from fusion_gym.core.task import make_bucket
+from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.core.token_bucket import TokenBucket, Tokens
+from fusion_gym.declaration import NumpyOnly
 from fusion_gym.errors import forbidden
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.remote import vector
@@ -70,7 +71,7 @@ class RemoteEstimationOptions(PaperOptions):
     error_scale: ArrayLike | None = None
     """Divisor of the observed errors: one number, or one per source. By default about the optimal
     threshold of a random walk at a price of 5, or at the rate that the tokens allow."""
-    filter: Annotated[str, _FILTERS] = "symmetric"
+    filter: Annotated[str, _FILTERS, NumpyOnly("truncated")] = "symmetric"
     """Estimator of the centre. ``"symmetric"`` repeats its prediction in silence. ``"truncated"``
     uses the silence of the policy ``trigger``; other policies are refused."""
     trigger: Trigger | None = None
@@ -183,7 +184,7 @@ def _error_scale(options: RemoteEstimationOptions, deviation: Array) -> Array:
     sensors = len(deviation)
     if options.error_scale is not None:
         return validation.positive("error_scale", options.error_scale, (sensors,))
-    bucket = make_bucket(options, sensors)
+    bucket = TokenBucket(options, sensors)
     if bucket.unlimited:
         single = (6.0 * _USUAL_PRICE) ** 0.25
         shared = math.sqrt(sensors) if options.access != "any" else 1.0
@@ -194,7 +195,7 @@ def _error_scale(options: RemoteEstimationOptions, deviation: Array) -> Array:
 def _steps(options: RemoteEstimationOptions, sensors: int) -> Array:
     """Return the steps between two packets of a sensor, at least 1, that the network sustains."""
     bucket, least = (
-        make_bucket(options, sensors),
+        TokenBucket(options, sensors),
         float(sensors) if options.access != "any" else 1.0,
     )
     steps = 0.0 if bucket.unlimited else bucket.round_cost / np.maximum(bucket.rate, 1e-3)

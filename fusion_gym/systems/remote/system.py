@@ -47,7 +47,7 @@ class ScalarSources(Plant[SourceTruth]):
     deviation: Array
     initial_deviation: Array
     nature: Nature = AS_ASSUMED
-    numpy_only = None
+    traceable = True
 
     @property
     def sensor_count(self) -> int:
@@ -161,9 +161,9 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
     independent_nodes = True
 
     @property
-    def numpy_only(self) -> str | None:  # type: ignore[override]
+    def traceable(self) -> bool:  # type: ignore[override]
         """See :class:`Estimator`."""
-        return None if self.silence is None else "filter"
+        return self.silence is None
 
     @property
     def reads_silence(self) -> bool:  # type: ignore[override]

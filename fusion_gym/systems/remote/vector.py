@@ -121,7 +121,7 @@ class VectorSources(NormalPlant):
     posterior: Array
     places: NDArray[np.int64]
     nature: Nature
-    numpy_only = None
+    traceable = True
 
     @classmethod
     def create(cls, sources: Sequence[Source], options: Any, horizon: int) -> VectorSources:
@@ -283,7 +283,7 @@ class VectorEstimator(Estimator[VectorEstimate]):
     error_scale: Array
     state_weights: Array
     signals = VECTOR_SIGNALS
-    numpy_only = None
+    traceable = True
     independent_nodes = True
     covariance_cycle = 1
 

@@ -18,8 +18,10 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from fusion_gym import validation
-from fusion_gym.core.options import AccessRule, Scenario, Tokens
+from fusion_gym.core.access import AccessRule
+from fusion_gym.core.options import Scenario
 from fusion_gym.core.reward import equal_weights
+from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.tobit import options as tobit_options
@@ -54,7 +56,7 @@ class BiasedOscillatorOptions(tobit_options.FeedbackOptions):
         >>> from fusion_gym.systems.tobit.biased import BiasedOscillatorOptions
         >>> options = BiasedOscillatorOptions(censoring_upper=8.0)
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.network.access, task.horizon
+        >>> task.sensors, task.options.access, task.horizon
         (2, 'single', 100)
     """
 
@@ -122,7 +124,7 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
         >>> from fusion_gym.systems.tobit.biased import BiasedTrackingOptions
         >>> options = BiasedTrackingOptions(horizon=50)
         >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.network.access, task.horizon
+        >>> task.sensors, task.options.access, task.horizon
         (2, 'single', 50)
     """
 

@@ -47,11 +47,13 @@ class Centre(Protocol):
     Attributes:
         separable: Whether :meth:`single` is available, and faster than one update after another.
         reads_silence: Whether a step without a delivery is information.
+        traceable: Whether JAX traces the methods.
     """
 
     filter: Any
     separable: ClassVar[bool] = False
     reads_silence: ClassVar[bool] = False
+    traceable: ClassVar[bool] = True
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -71,11 +73,6 @@ class Centre(Protocol):
     def predictable(self) -> bool:
         """Whether the covariances depend on the deliveries only."""
         return False
-
-    @property
-    def numpy_only(self) -> str | None:
-        """Name of the option that needs ``backend="numpy"``, or ``None``."""
-        return None
 
     def advance(self, model: LinearPlant, state: Any) -> tuple[Gaussian, CentrePrediction]:
         """Return the prior and the prediction one step after a state's delivery."""

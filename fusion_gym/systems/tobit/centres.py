@@ -130,7 +130,7 @@ class HoldCentre(Centre):
 
     filter: KalmanFilter
     plant: LinearPlant
-    numpy_only = "filter"
+    traceable = False
 
     @functools.cached_property
     def inverse(self) -> Array:
@@ -277,7 +277,7 @@ class TruncatedCentre(FederatedCentre):
     predictable = False
     separable = False
     reads_silence = True
-    numpy_only = "filter"
+    traceable = False
     local_means = Centre.local_means
     variances = Centre.variances
 

@@ -12,7 +12,8 @@ from scipy.linalg import block_diag
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import Scenario, plain_options
+from fusion_gym.core.options import Scenario
+from fusion_gym.declaration import NumpyOnly, plain_options
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
@@ -234,7 +235,7 @@ class LinearFusionOptions(tobit_options.FeedbackOptions):
     token_rate: ArrayLike = 1.0
     token_capacity: ArrayLike = 15.0
     initial_tokens: ArrayLike = 6.0
-    filter: Annotated[str | None, _FILTERS] = None
+    filter: Annotated[str | None, _FILTERS, NumpyOnly("hold", "truncated")] = None
     """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
     ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
     assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``

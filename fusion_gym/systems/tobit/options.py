@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, Scenario, plain_options
+from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.declaration import plain_options
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude

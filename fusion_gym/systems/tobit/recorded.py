@@ -76,7 +76,7 @@ class RecordedFusionOptions(LinearFusionOptions):
 class RecordedPlant(CensoredPlant):
     """A linear plant with gaps in its measurements: a measurement's noise of NaN is a gap."""
 
-    numpy_only = "log"  # type: ignore[assignment]
+    traceable = False
 
     @property
     def start_channels(self) -> int:

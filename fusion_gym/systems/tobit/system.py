@@ -196,9 +196,9 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
         return SIGNALS if self.level is None else (*SIGNALS, _SAMPLED)
 
     @property
-    def numpy_only(self) -> str | None:  # type: ignore[override]
+    def traceable(self) -> bool:  # type: ignore[override]
         """See :class:`Estimator`."""
-        return self.centre.numpy_only
+        return self.centre.traceable
 
     @property
     def reads_silence(self) -> bool:  # type: ignore[override]

@@ -19,7 +19,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.admission import LARGEST_ERROR
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, Scenario, Tokens
+from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.parts import numbered_states
