@@ -7,8 +7,10 @@ entries of Stable-Baselines3, which also a model without a card has.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -171,8 +173,10 @@ def algorithm_of(data: Mapping[str, Any]) -> str | None:
     if isinstance(card_entry, str):
         return card_entry
     module = _table(data, "policy_class").get("__module__")
-    entry = next((n for n, policy in POLICIES.items() if policy.__module__ == module), None)
-    return "ppo" if entry == "a2c" and "clip_range" in data else entry
+    for name, kind in ALGORITHMS.items():
+        if any(policy.__module__ == module for policy in kind.policy_aliases.values()):
+            return "ppo" if name == "a2c" and "clip_range" in data else name
+    return None
 
 
 def _arguments(settings: Plain) -> Arguments:
@@ -181,6 +185,11 @@ def _arguments(settings: Plain) -> Arguments:
     if strange:
         raise NeedsTrust(f"its policy has other settings, {strange}")
     result = {name: settings[name] for name in sorted(_NETWORKS & settings.keys())}
+    for name in ("lstm_hidden_size", "n_lstm_layers", "net_arch"):
+        if isinstance(result.get(name), str):  # Stable-Baselines3 writes NumPy's numbers as text
+            text = re.sub(r"np\.int\d+\((\d+)\)", r"\1", result[name]).replace("'", '"')
+            with suppress(ValueError, RecursionError):
+                result[name] = json.loads(text)
     layers = sum(1 for _ in validation.nested("policy_kwargs", result))
     if layers > MOST or result.get("n_lstm_layers", 1) not in range(MOST):
         raise NeedsTrust(f"its networks have more than {MOST} layers")

@@ -137,8 +137,9 @@ def _unpickled(
     file: Path, data: Mapping[str, Any], task: Task, observed: card.ModelView
 ) -> tuple[BaseAlgorithm, str]:
     """Return the model from the loader of Stable-Baselines3, which runs code of the file."""
-    problems = []
-    for name in _candidates(data):
+    problems, known = [], card.algorithm_of(data)
+    likely = ["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"]  # of an own policy
+    for name in [known] if known in card.ALGORITHMS else likely:
         try:
             model = card.ALGORITHMS[name].load(file, device="cpu")
         except Exception as error:  # the file's code may raise any error
@@ -147,20 +148,6 @@ def _unpickled(
         shape = model.observation_space.shape or ()
         return model, _fitted(task, observed, shape, space_text(model.action_space))[0]
     raise ConfigurationError(f"it cannot be loaded as {'; '.join(problems)}")
-
-
-def _candidates(data: Mapping[str, Any]) -> list[str]:
-    """Return the algorithms of both libraries that may have saved the file."""
-    received, described = card.algorithm_of(data), data.get("policy_class")
-    if received in card.ALGORITHMS:
-        return [received]
-    module = described.get("__module__") if isinstance(described, dict) else None
-    result = [
-        name
-        for name, kind in card.ALGORITHMS.items()
-        if any(policy.__module__ == module for policy in kind.policy_aliases.values())
-    ]
-    return result or (["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"])
 
 
 def _fitted(
