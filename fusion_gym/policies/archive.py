@@ -19,7 +19,7 @@ from fusion_gym.entries import Plain
 from fusion_gym.validation import ConfigurationError
 
 LARGEST = 256 * 2**20  # bytes of a part, and of all weights
-_MOST = 1_000  # tensors
+MOST = 1_000  # tensors
 # Errors of zipfile on a damaged archive; RuntimeError where a part is encrypted.
 DAMAGE = (
     zipfile.BadZipFile,
@@ -50,27 +50,24 @@ def read_plain(file: Path, name: str = "data") -> Plain:
 
 def read_weights(file: Path) -> dict[str, torch.Tensor]:
     """Return the policy's weights by name, finite float32."""
-    content = io.BytesIO(read_part(file, "policy.pth"))
+    part = read_part(file, "policy.pth")
     try:
-        with zipfile.ZipFile(content) as parts:
-            listed = parts.infolist()
-    except DAMAGE:
-        raise NeedsTrust("its policy.pth is not in torch's format") from None
-    if any(part.compress_type != zipfile.ZIP_STORED for part in listed):
-        raise NeedsTrust("its weights are compressed")
-    content.seek(0)
-    try:
-        data = torch.load(content, map_location="cpu", weights_only=True)
+        with zipfile.ZipFile(io.BytesIO(part)) as packed:
+            stored = all(item.compress_type == zipfile.ZIP_STORED for item in packed.infolist())
+        data = torch.load(io.BytesIO(part), "cpu", weights_only=True) if stored else None
     except Exception:  # a crafted file may raise any error
         raise NeedsTrust("its policy.pth holds more than plain weights") from None
-    if not isinstance(data, dict) or len(data) > _MOST or not all(map(_is_plain, data.values())):
+    if not stored:
+        raise NeedsTrust("its weights are compressed")
+    if not isinstance(data, dict) or len(data) > MOST or not all(map(_is_plain, data.values())):
         raise NeedsTrust("its policy.pth is not a table of float32 weights")
     size = 4 * sum(weight.numel() for weight in data.values())
     if size > LARGEST:
         raise NeedsTrust(f"its weights have {size} bytes, more than {LARGEST}")
     if not all(bool(torch.isfinite(weight).all()) for weight in data.values()):
         raise _none("its weights are not finite")
-    return {str(name): weight for name, weight in data.items()}
+    # Copies, because the tensors of a file may share memory.
+    return {str(name): weight.clone() for name, weight in data.items()}
 
 
 def read_part(file: Path, name: str) -> bytes:
@@ -91,12 +88,10 @@ def read_part(file: Path, name: str) -> bytes:
 
 
 def _is_plain(weight: Any) -> bool:
-    return (
-        type(weight) is torch.Tensor
-        and weight.layout is torch.strided
-        and weight.dtype is torch.float32
-        and weight.device.type == "cpu"
-    )
+    if type(weight) is not torch.Tensor:
+        return False
+    kind = (weight.layout, weight.dtype, weight.device.type)
+    return kind == (torch.strided, torch.float32, "cpu")
 
 
 def _none(reason: str) -> ConfigurationError:

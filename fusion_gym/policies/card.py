@@ -1,35 +1,35 @@
 """The card of a saved agent: its description in plain JSON.
 
 The card is the entry ``fusion_gym_model`` of the archive's ``data``, so Stable-Baselines3 saves and
-loads it with the model. For a model without a card, or with an earlier and shorter card, the
-readable entries of Stable-Baselines3 replace it.
+loads it with the model. It describes the observation; networks and spaces are in the readable
+entries of Stable-Baselines3, which also a model without a card has.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import sb3_contrib
 import stable_baselines3
-import torch
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.dqn.policies import DQNPolicy
+from torch import nn
 
 from fusion_gym import validation
-from fusion_gym.core.action import space_text
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
-from fusion_gym.entries import Plain
+from fusion_gym.entries import Arguments, Plain
 from fusion_gym.envs.views import make_view
-from fusion_gym.policies.archive import NeedsTrust
-from fusion_gym.policies.network import NetworkShape
+from fusion_gym.policies.archive import MOST, NeedsTrust
 from fusion_gym.validation import ConfigurationError, display
 
 ENTRY = "fusion_gym_model"
@@ -50,21 +50,21 @@ POLICIES: dict[str, type[BasePolicy]] = {
     if policy
     in (ActorCriticPolicy, DQNPolicy, MaskableActorCriticPolicy, RecurrentActorCriticPolicy)
 }
-ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
-    "elu": torch.nn.ELU,
-    "gelu": torch.nn.GELU,
-    "leaky_relu": torch.nn.LeakyReLU,
-    "relu": torch.nn.ReLU,
-    "silu": torch.nn.SiLU,
-    "tanh": torch.nn.Tanh,
+_ACTIVATIONS: dict[str, type[nn.Module]] = {
+    str(kind): kind for kind in (nn.ELU, nn.GELU, nn.LeakyReLU, nn.ReLU, nn.SiLU, nn.Tanh)
 }
-# The allowed policy_kwargs: an activation, entries that the weights' shapes imply, and entries
-# without influence on a decision. A features_extractor_class, for example, is code.
-_HARMLESS = {
-    "activation_fn", "enable_critic_lstm", "log_std_init", "lstm_hidden_size", "n_lstm_layers",
-    "net_arch", "normalize_images", "optimizer_class", "optimizer_kwargs", "ortho_init",
-    "share_features_extractor", "shared_lstm",
+# The allowed policy_kwargs: those of the networks, and those without influence on a decision. A
+# features_extractor_class, for example, is code.
+_NETWORKS = {
+    "activation_fn", "enable_critic_lstm", "lstm_hidden_size", "n_lstm_layers", "net_arch",
+    "shared_lstm",
 }  # fmt: skip
+_HARMLESS = {
+    "log_std_init", "normalize_images", "optimizer_class", "optimizer_kwargs", "ortho_init",
+    "share_features_extractor",
+}  # fmt: skip
+# Entries of earlier cards, which the entries of Stable-Baselines3 repeat.
+_REPEATED = {"actions", "activation", "network"}
 
 
 @dataclass(frozen=True)
@@ -121,54 +121,43 @@ class Blueprint:
     """The description from which a policy is built, with its weights and the task's spaces."""
 
     algorithm: str
-    activation: str
+    arguments: Arguments  # of the policy's class
+    shape: tuple[int]  # of an observation
     actions: str  # the action space, as Gymnasium writes it
-    network: Mapping[str, Any] | None = None  # as :meth:`NetworkShape.plain` returns it
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> Blueprint:
-        """Return the blueprint of the card, or of the readable entries of Stable-Baselines3."""
+        """Return the blueprint of the readable entries of Stable-Baselines3."""
         card_entry = _entry(data)
-        if "format" not in card_entry:
-            return _inferred(data)
-        validation.integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
-        own = ModelView.__dataclass_fields__.keys() | cls.__dataclass_fields__.keys()
-        validation.keys("entry of the card", card_entry, {"format", "reward_scale"} | own)
-        if not isinstance(card_entry.get("network"), dict):
-            raise ConfigurationError("network is not allowed: it must be a table of sizes")
-        return cls(
-            validation.choice("algorithm", card_entry.get("algorithm"), POLICIES),
-            validation.choice("activation", card_entry.get("activation"), ACTIVATIONS),
-            str(card_entry.get("actions")),
-            card_entry["network"],
-        )
+        if "format" in card_entry:
+            validation.integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
+            known = {"format", "algorithm", "reward_scale"} | ModelView.__dataclass_fields__.keys()
+            validation.keys("entry of the card", card_entry, known | _REPEATED)
+        algorithm = algorithm_of(data)
+        module = _table(data, "policy_class").get("__module__")
+        if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
+            raise NeedsTrust(f"its policy belongs to none of {', '.join(POLICIES)}")
+        match _table(data, "observation_space"):
+            case {":type:": "<class 'gymnasium.spaces.box.Box'>", "_shape": [int(size)]}:
+                return cls(
+                    algorithm, _arguments(_table(data, "policy_kwargs")), (size,), _actions(data)
+                )
+        raise NeedsTrust("its observation is not a vector")
 
 
-def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> Plain:
-    """Return a model's card, shorter and without a format if weights cannot rebuild its policy."""
-    view = make_view(task, local)
+def model_card(algorithm: str, task: Task, local: bool) -> Plain:
+    """Return the card of a model that observes the task, or a sensor's local view of it."""
     entries = {
+        "format": FORMAT,
         "algorithm": algorithm,
-        "observation_names": list(view.names),
+        "observation_names": list(make_view(task, local).names),
         "local": local,
         "price_range": task.reward.price.span,
     }
     if task.nominal_error is not None:
         entries["nominal_error"] = task.nominal_error.tolist()
         entries["reward_scale"] = task.settings["reward_scale"]
-    policy: Any = model.policy
-    if type(policy) is not POLICIES.get(algorithm) or set(model.policy_kwargs) - _HARMLESS:
-        return entries
-    names = [name for name, kind in ACTIVATIONS.items() if kind is policy.activation_fn]
-    if not names:
-        return entries
-    network = NetworkShape.of_weights(policy.state_dict())
-    plain = {
-        "activation": names[0],
-        "actions": space_text(model.action_space),
-        "network": network.plain(),
-    }
-    return {"format": FORMAT} | entries | plain
+    return entries
 
 
 def algorithm_name(model: BaseAlgorithm) -> str:
@@ -183,31 +172,41 @@ def algorithm_of(data: Mapping[str, Any]) -> str | None:
     if isinstance(card_entry, str):
         return card_entry
     module = _table(data, "policy_class").get("__module__")
-    entry = next((n for n, policy in POLICIES.items() if policy.__module__ == module), None)
-    return "ppo" if entry == "a2c" and "clip_range" in data else entry
+    for name, kind in ALGORITHMS.items():
+        if any(policy.__module__ == module for policy in kind.policy_aliases.values()):
+            return "ppo" if name == "a2c" and "clip_range" in data else name
+    return None
 
 
-def _inferred(data: Mapping[str, Any]) -> Blueprint:
-    """Return the blueprint of a model without a card, or with an earlier card."""
-    algorithm, settings = algorithm_of(data), _table(data, "policy_kwargs")
-    module = _table(data, "policy_class").get("__module__")
-    if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
-        raise NeedsTrust(f"its policy belongs to none of {', '.join(POLICIES)}")
-    if "gymnasium.spaces.box.Box" not in str(_table(data, "observation_space").get(":type:")):
-        raise NeedsTrust("its observation is not a vector")
-    strange = sorted(set(settings) - _HARMLESS - {":type:", ":serialized:"})
+def _arguments(settings: Plain) -> Arguments:
+    """Return the arguments of the policy's class in its readable policy_kwargs."""
+    strange = sorted(settings.keys() - _NETWORKS - _HARMLESS - {":type:", ":serialized:"})
     if strange:
         raise NeedsTrust(f"its policy has other settings, {strange}")
-    usual = ACTIVATIONS["relu" if algorithm == "dqn" else "tanh"]  # the policies' default
-    value = settings.get("activation_fn", str(usual))
-    names = [n for n, kind in ACTIVATIONS.items() if str(kind) == value]
-    if not names:
-        raise NeedsTrust(f"its activation is {value!r}")
+    result = {name: settings[name] for name in sorted(_NETWORKS & settings.keys())}
+    for name in ("lstm_hidden_size", "n_lstm_layers", "net_arch"):
+        if isinstance(result.get(name), str):  # Stable-Baselines3 writes NumPy's numbers as text
+            text = re.sub(r"np\.int\d+\((\d+)\)", r"\1", result[name]).replace("'", '"')
+            with suppress(ValueError, RecursionError):
+                result[name] = json.loads(text)
+    layers = sum(1 for _ in validation.nested("policy_kwargs", result))
+    if layers > MOST or result.get("n_lstm_layers", 1) not in range(MOST):
+        raise NeedsTrust(f"its networks have more than {MOST} layers")
+    if "activation_fn" in result:
+        value = str(result["activation_fn"])
+        if value not in _ACTIVATIONS:
+            raise NeedsTrust(f"its activation is {value!r}")
+        result["activation_fn"] = _ACTIVATIONS[value]
+    return result
+
+
+def _actions(data: Mapping[str, Any]) -> str:
+    """Return the action space, as Gymnasium writes it."""
     space = _table(data, "action_space")
     kind = re.sub(r".*\.(\w+)'>$", r"\1", str(space.get(":type:")))
     start = f", start={space['start']}" if str(space.get("start", 0)).strip("[0 \n]") else ""
     number = " ".join(str(space.get("n", space.get("nvec"))).split())
-    return Blueprint(algorithm, names[0], f"{kind}({number}{start})")
+    return f"{kind}({number}{start})"
 
 
 def _entry(data: Mapping[str, Any]) -> Plain:

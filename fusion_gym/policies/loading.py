@@ -1,8 +1,8 @@
 """Load a saved agent; a model file is data.
 
-The policy is rebuilt from its weights and its card, or from the readable entries of
-Stable-Baselines3 in the place of the card. Nothing in the file is unpickled. With ``trust`` the
-loader of Stable-Baselines3 loads the file and runs code that it contains.
+The policy is rebuilt from its weights and the readable entries of Stable-Baselines3. Nothing in the
+file is unpickled. With ``trust`` the loader of Stable-Baselines3 loads the file and runs code that
+it contains.
 """
 
 import pickle
@@ -23,7 +23,6 @@ from fusion_gym.envs.views import View, make_view
 from fusion_gym.policies import card
 from fusion_gym.policies.archive import NeedsTrust, read_plain, read_weights
 from fusion_gym.policies.model import ModelPolicy
-from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError
 
 
@@ -104,24 +103,29 @@ def model_file(path: str) -> Path:
 def _rebuilt(
     file: Path, data: Mapping[str, Any], task: Task, observed: card.ModelView
 ) -> tuple[BaseAlgorithm, str]:
-    """Return the model from its card and its weights, and its kind of action."""
+    """Return the model from its readable entries and its weights, and its kind of action."""
     blueprint, weights = card.Blueprint.read(data), read_weights(file)
-    network = NetworkShape.of_weights(weights)
-    if blueprint.network not in (None, network.plain()):
-        raise ConfigurationError(f"its card's network differs from its weights, {network.plain()}")
-    if not network.fits(blueprint.algorithm):
-        raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}")
-    action, view = _fitted(task, observed, (network.entries,), blueprint.actions)
+    action, view = _fitted(task, observed, blueprint.shape, blueprint.actions)
     # Without environment, buffers and optimiser, so it cannot learn.
     kind: Any = card.ALGORITHMS[blueprint.algorithm]
     base = card.POLICIES[blueprint.algorithm]
     model = kind(base, env=None, device="cpu", _init_setup_model=False)
     model.observation_space, model.action_space = view.space, view.action.space
-    model.policy = _policy(blueprint, network, view)
+    # On the meta device the declared networks take no memory before the weights fit them.
+    meta = torch.device("meta")
     try:
-        model.policy.load_state_dict(weights, strict=True)
-    except RuntimeError:
+        with meta:
+            model.policy = type("Declared", (base,), {"device": meta})(
+                view.space,
+                view.action.space,
+                lr_schedule=lambda _: 0.0,
+                optimizer_class=lambda *_, **__: None,
+                **blueprint.arguments,
+            )
+        model.policy.load_state_dict(weights, strict=True, assign=True)
+    except Exception:  # a crafted file may declare anything
         raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}") from None
+    model.policy.__class__ = base
     if blueprint.algorithm == "dqn":  # its random decisions need the exploration rate
         rate = data.get("exploration_rate", 0.0)
         rate = validation.number("exploration_rate", rate, at_least=0.0, at_most=1.0)
@@ -129,26 +133,13 @@ def _rebuilt(
     return model, action
 
 
-def _policy(blueprint: card.Blueprint, network: NetworkShape, view: View) -> Any:
-    """Return the policy with arbitrary weights, without use of torch's global random numbers."""
-    kind: Any = card.POLICIES[blueprint.algorithm]
-    with torch.random.fork_rng(devices=[]):
-        return kind(
-            view.space,
-            view.action.space,
-            lr_schedule=lambda _: 0.0,
-            activation_fn=card.ACTIVATIONS[blueprint.activation],
-            optimizer_class=lambda *_, **__: None,
-            **network.arguments(),
-        )
-
-
 def _unpickled(
     file: Path, data: Mapping[str, Any], task: Task, observed: card.ModelView
 ) -> tuple[BaseAlgorithm, str]:
     """Return the model from the loader of Stable-Baselines3, which runs code of the file."""
-    problems = []
-    for name in _candidates(data):
+    problems, known = [], card.algorithm_of(data)
+    likely = ["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"]  # of an own policy
+    for name in [known] if known in card.ALGORITHMS else likely:
         try:
             model = card.ALGORITHMS[name].load(file, device="cpu")
         except Exception as error:  # the file's code may raise any error
@@ -157,20 +148,6 @@ def _unpickled(
         shape = model.observation_space.shape or ()
         return model, _fitted(task, observed, shape, space_text(model.action_space))[0]
     raise ConfigurationError(f"it cannot be loaded as {'; '.join(problems)}")
-
-
-def _candidates(data: Mapping[str, Any]) -> list[str]:
-    """Return the algorithms of both libraries that may have saved the file."""
-    received, described = card.algorithm_of(data), data.get("policy_class")
-    if received in card.ALGORITHMS:
-        return [received]
-    module = described.get("__module__") if isinstance(described, dict) else None
-    result = [
-        name
-        for name, kind in card.ALGORITHMS.items()
-        if any(policy.__module__ == module for policy in kind.policy_aliases.values())
-    ]
-    return result or (["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"])
 
 
 def _fitted(

@@ -25,7 +25,7 @@ from fusion_gym.validation import refusal
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
     """Write the model's card (:mod:`fusion_gym.policies.card`) into it before it is saved."""
-    setattr(model, ENTRY, model_card(algorithm_name(model), model, task, local))
+    setattr(model, ENTRY, model_card(algorithm_name(model), task, local))
 
 
 class ModelPolicy:

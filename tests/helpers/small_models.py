@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO
@@ -16,6 +17,7 @@ OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20}
 DISCRETE, LOCAL, MEMORY = {"action": "discrete"}, {"local": True}, {"memory": True}
 MULTI = {"action": "multidiscrete"}
 RELU = {"net_arch": {"pi": [8], "vf": [6, 5]}, "activation_fn": torch.nn.ReLU}
+NUMPY = {"net_arch": {"pi": [np.int64(8)], "vf": [np.int64(6), 5]}}
 GELU = {"activation_fn": torch.nn.GELU}
 SHARED = {"lstm_hidden_size": 6, "n_lstm_layers": 2, "shared_lstm": True}
 LINEAR = {"lstm_hidden_size": 6, "net_arch": []}
@@ -50,6 +52,7 @@ MODELS = {
     "ppo": Recipe(PPO),
     "ppo_memory": Recipe(PPO, options=MEMORY, arguments={"policy_kwargs": GELU}),
     "ppo_discrete": Recipe(PPO, options=DISCRETE, arguments={"policy_kwargs": RELU}),
+    "ppo_numpy": Recipe(PPO, arguments={"policy_kwargs": NUMPY}),
     "ppo_local_memory": Recipe(PPO, options=MEMORY | LOCAL),
     "a2c_centre": Recipe(A2C, options={"information": "centre"}),
     "dqn": Recipe(DQN, options=DISCRETE, arguments={"buffer_size": 10}),

@@ -131,10 +131,8 @@ def test_the_file_with_a_card_is_an_ordinary_one(saved: Models) -> None:
     again = PPO.load(agent.carded, device="cpu")
     same_weights(agent.model, again)
     card_entry = again.fusion_gym_model
-    assert card_entry["network"] == {"pi": [8], "vf": [6, 5]}
-    assert (card_entry["activation"], card_entry["actions"]) == ("relu", "Discrete(8)")
-    memory = saved("recurrent_shared").model.fusion_gym_model["network"]["memory"]  # type: ignore[attr-defined]
-    assert memory == {"size": 6, "layers": 2, "critic": "shared"}
+    assert (card_entry["format"], card_entry["algorithm"]) == (1, "ppo")
+    assert len(card_entry["observation_names"]) == again.observation_space.shape[0]
 
 
 class Payload:
@@ -272,15 +270,25 @@ def weights(change: Callable[[dict[Any, Any]], Any]) -> Parts:
     return parts
 
 
-def card(**entries: Any) -> Parts:
-    """Other entries of the card."""
+def entry(name: str, **entries: Any) -> Parts:
+    """Other readable entries of Stable-Baselines3."""
 
     def parts(agent: Saved) -> tuple[Path, dict[str, bytes]]:
         data = data_of(agent.carded)
-        data["fusion_gym_model"] |= entries
+        data[name] |= entries
         return agent.carded, {"data": json.dumps(data).encode()}
 
     return parts
+
+
+def card(**entries: Any) -> Parts:
+    """Other entries of the card."""
+    return entry("fusion_gym_model", **entries)
+
+
+def network(**arguments: Any) -> Parts:
+    """Other arguments of the policy's class, as the file declares them."""
+    return entry("policy_kwargs", **arguments)
 
 
 def compressed() -> bytes:
@@ -298,18 +306,25 @@ REFUSED: dict[str, tuple[Parts, str]] = {
     "shape": (weights(lambda w: w | {HEAD: w[HEAD][:2]}), "--trust"),
     "sparse": (weights(lambda w: w | {HEAD: w[HEAD].to_sparse()}), "--trust"),
     "huge": (weights(lambda w: w | {HEAD: torch.zeros(1).expand(10**6, 10**6)}), "bytes"),
-    "wide": (weights(lambda w: w | {FIRST: torch.zeros(1).expand(10**7, 1)}), "disagree"),
+    "wide": (weights(lambda w: w | {FIRST: torch.zeros(1).expand(10**7, 1)}), "do not fit ppo"),
     "nan": (weights(lambda w: w | {HEAD: w[HEAD] * torch.nan}), "not finite"),
     "list": (weights(lambda w: [w]), "--trust"),
     "many": (weights(lambda w: dict.fromkeys(map(str, range(2000)), torch.zeros(1))), "--trust"),
     "compressed": (lambda a: (a.plain, {"policy__pth": compressed()}), "weights are compressed"),
     "no JSON": (lambda a: (a.carded, {"data": b"[" * 100_000}), "its data is not JSON"),
     "format": (card(format="1"), "format = '1'"),
-    "algorithm": (card(algorithm="sac"), "algorithm = 'sac'"),
+    "algorithm": (card(algorithm="sac"), "its policy belongs to none of"),
     "another": (card(algorithm="dqn"), "--trust"),
-    "activation": (card(activation="sine"), "activation = 'sine'"),
-    "actions": (card(actions="Discrete(3)"), "Discrete(3)"),
-    "network": (card(network={"pi": [64, 64], "vf": [64, 65]}), "network"),
+    "activation": (network(activation_fn="sine"), "its activation is 'sine'"),
+    "actions": (entry("action_space", n=4), "MultiBinary(4)"),
+    "matrix": (entry("observation_space", _shape=[9, 6]), "its observation is not a vector"),
+    "network": (network(net_arch={"pi": [64, 64], "vf": [64, 65]}), "do not fit ppo"),
+    "words": (network(net_arch="a wide one"), "do not fit ppo"),
+    "memory": (network(lstm_hidden_size=64), "do not fit ppo"),
+    "huge network": (network(net_arch=[10**9] * 3), "do not fit ppo"),
+    "endless network": (network(net_arch=[10**30]), "do not fit ppo"),
+    "deep network": (network(net_arch=[1] * 2000), "more than 1000 layers"),
+    "deep memory": (network(n_lstm_layers=10**9), "more than 1000 layers"),
     "names": (card(observation_names=["a", "b"]), "missing are ['a', 'b']"),
     "local": (card(local=True), "layout"),
     "price_range": (card(price_range=[1.0, 0.5]), "price_range"),
