@@ -38,7 +38,7 @@ def unsearched(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def small_studies(monkeypatch: pytest.MonkeyPatch) -> None:
     """Studies of a log end within seconds."""
-    from fusion_gym.evaluation import field_study
+    from fusion_gym.recordings import field_study
 
     few = {"_TRIALS": 2, "_EPISODES": 4, "_CLOSE": 0.3, "FACTORS": (0.5, 1.0, 2.0), "RESAMPLES": 20}
     for name, value in few.items():

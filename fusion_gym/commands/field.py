@@ -33,15 +33,13 @@ from fusion_gym.commands.log_options import FitOptions, warn
 from fusion_gym.commands.options import OUTPUT_FOLDER, between, whole
 from fusion_gym.entries import Options, Plain
 from fusion_gym.errors import forbidden
-from fusion_gym.evaluation import field_study
-from fusion_gym.evaluation.devices import DeviceName, longest_interval, step_of
-from fusion_gym.evaluation.field_study import METHODS, PRACTICE, FieldStudy, MethodPoint, scale
 from fusion_gym.output import files
 from fusion_gym.output.ending import ended_like_by_ctrl_c
-from fusion_gym.output.field_report import FieldReport, draw_card, draw_curves, write_report
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.settings import parse_settings, parse_value
-from fusion_gym.recordings import Recording, fit, fitting
+from fusion_gym.recordings import Recording, field_report, field_study, fit, fitting
+from fusion_gym.recordings.field_report import DeviceName, FieldReport
+from fusion_gym.recordings.field_study import METHODS, PRACTICE, FieldStudy, MethodPoint, scale
 from fusion_gym.recordings.recording import SHIPPED
 from fusion_gym.training import config
 from fusion_gym.training.algorithms import settings
@@ -88,7 +86,7 @@ class Field(FitOptions, Long):
         names = [channel.name for channel in recording.channels]
         tolerance = tolerances(self.tolerance, names) if self.tolerance else ()
         seconds = recording.interval.total_seconds()
-        longest = longest_interval(self.device, seconds) if self.device else math.inf
+        longest = field_report.longest_interval(self.device, seconds) if self.device else math.inf
         inputs: Plain = {"log": joblib.hash(whole.values), "device": self.device}
         inputs |= {"tolerance": tolerance} if tolerance else {"target_rate": rate}
         inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
@@ -112,7 +110,7 @@ class Field(FitOptions, Long):
             options=plant.options | {"fit_share": self.share}, rate=rate,
             shape=tolerance or plant.typical_changes, horizon=horizon,
             source="resampled" if complete >= _COMPLETE else "normal", tolerance=tolerance,
-            steps=tuple(step_of(self.device, channel.unit) for channel in recording.channels),
+            steps=tuple(field_report.step_of(self.device, c.unit) for c in recording.channels),
             longest=longest, trials=self.output / "trials",
         )  # fmt: skip
         log = self.log if self.log in SHIPPED else str(Path(self.log).absolute())
@@ -144,15 +142,15 @@ class Field(FitOptions, Long):
                 paths = self.measure_methods(study)
             read = {name: files.read_json(path, "output") for name, path in paths.items()}
             points = {name: [MethodPoint(**p) for p in own["points"]] for name, own in read.items()}
-            draw_card(whole, self.output / "card.png")
+            field_report.draw_card(whole, self.output / "card.png")
             results = [] if tolerance else field_study.compare_with_practice(study, points)
-            draw_curves(study, points, self.output / "curves.png")
+            field_report.draw_curves(study, points, self.output / "curves.png")
             report = FieldReport(
                 name=Path(self.log).name, whole=whole, recording=recording, study=study,
                 rows=rows, criticism=criticism, warnings=warnings,
                 points=points, results=results, device=self.device,
             )  # fmt: skip
-            print(write_report(report, self.output))
+            print(field_report.write_report(report, self.output))
             shutil.rmtree(self.output / "trials", ignore_errors=True)
 
     def measure_methods(self, study: FieldStudy) -> dict[str, Path]:

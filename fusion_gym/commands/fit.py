@@ -18,11 +18,11 @@ import yaml
 from fusion_gym.commands.command_line import Command
 from fusion_gym.commands.log_options import FitOptions, warn
 from fusion_gym.commands.options import OutputFile
-from fusion_gym.output.field_report import RATIOS, criticism_rows
 from fusion_gym.output.files import write_text
 from fusion_gym.output.progress import writing
 from fusion_gym.output.tables import console, table_tables
 from fusion_gym.recordings import FittedPlant, Recording, fit, fitting
+from fusion_gym.recordings.field_report import RATIOS, criticism_rows
 from fusion_gym.version import __version__
 
 

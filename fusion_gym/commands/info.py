@@ -24,7 +24,6 @@ from fusion_gym.commands.log_options import LogOptions
 from fusion_gym.commands.options import OutputFile
 from fusion_gym.docstrings import plain_marks
 from fusion_gym.envs.registration import present_id
-from fusion_gym.output.progress import writing
 from fusion_gym.output.tables import console
 from fusion_gym.training.catalogue import catalogue
 from fusion_gym.validation import nearest, refusal
@@ -47,7 +46,7 @@ class Info(LogOptions, Command):
         names = [entry for named in entries.values() for entry in named]
         is_log = name in ("mast", "tanks") or ".csv" in Path(name).suffixes
         if name not in names and (is_log or Path(name).is_file()):
-            self._show_log()
+            self.show(self.name, self.picture)
             return
         picture = None if self.picture is None else str(self.picture)
         for option, value in {"picture": picture, **self.reading}.items():
@@ -59,17 +58,6 @@ class Info(LogOptions, Command):
         for kind, named in entries.items():
             if name in named:
                 print(plain_text(f"# {name} ({kind})\n\n{named[name].page()}", console()))
-
-    def _show_log(self) -> None:
-        from fusion_gym.output.field_report import card_lines, card_table, draw_card
-        from fusion_gym.recordings import Recording
-
-        recording = Recording.read(self.name, **self.reading)
-        print("\n".join(card_lines(recording)))
-        console().print(card_table(recording))
-        if self.picture is not None:
-            writing(("picture", self.picture))
-            draw_card(recording, self.picture)
 
 
 _WORDS = {r"\\mathsf\s+T": "T", r"\\iff": " ⇔ ", r"\\(arg|det)": r"\1 ", r"\\Pr": "Pr"}

@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from fusion_gym.commands.options import between
-from fusion_gym.output.progress import remark
+from fusion_gym.output.progress import remark, writing
+from fusion_gym.output.tables import console
 
 if TYPE_CHECKING:
     from fusion_gym.recordings import Recording
@@ -27,6 +29,17 @@ class LogOptions:
         """Keyword arguments of ``Recording.read``."""
         return {"date_format": self.date_format, "time_unit": self.time_unit,
                 "error_codes": self.error_code}  # fmt: skip
+
+    def show(self, log: str, picture: Path | None) -> None:
+        """Print the data card of a log, and draw its readings if there is a file for them."""
+        from fusion_gym.recordings import Recording, field_report
+
+        recording = Recording.read(log, **self.reading)
+        print("\n".join(field_report.card_lines(recording)))
+        console().print(field_report.card_table(recording))
+        if picture is not None:
+            writing(("picture", picture))
+            field_report.draw_card(recording, picture)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -77,7 +77,7 @@ ENVIRONMENTS: dict[str, str | Build] = {
     "fusion_gym/BiasedOscillator-v1": "fusion_gym.systems.tobit.biased:build_biased_oscillator",
     "fusion_gym/BiasedTracking-v1": "fusion_gym.systems.tobit.biased:build_biased_tracking",
     "fusion_gym/LinearFusion-v2": "fusion_gym.systems.tobit.linear:build_linear",
-    "fusion_gym/RecordedFusion-v1": "fusion_gym.systems.tobit.recorded:build_recorded",
+    "fusion_gym/RecordedFusion-v1": "fusion_gym.recordings.environment:build_recorded",
     "fusion_gym/RemoteEstimation-v1": "fusion_gym.systems.remote.environment:build_remote",
 }
 

@@ -1,15 +1,13 @@
-"""Recordings of sensors: logs, their data cards, and plants fitted to them."""
+"""Logs of sensors: data cards, fitted plants, an environment, and the study of their reports."""
+
+from typing import TYPE_CHECKING, Any
 
 from fusion_gym.importing import require
 
-require("a recording", "agents", "pandas", "statsmodels")
-
-from fusion_gym.recordings.fitting import Criticism, FittedPlant, criticise, fit  # noqa: E402
-from fusion_gym.recordings.recording import (  # noqa: E402
-    ChannelCard,
-    RecordedChannel,
-    Recording,
-)
+if TYPE_CHECKING:
+    from fusion_gym.recordings.card import ChannelCard, RecordedChannel
+    from fusion_gym.recordings.fitting import Criticism, FittedPlant, criticise, fit
+    from fusion_gym.recordings.recording import Recording
 
 __all__ = [
     "ChannelCard",
@@ -20,3 +18,14 @@ __all__ = [
     "criticise",
     "fit",
 ]
+
+if not TYPE_CHECKING:  # type checkers see only the names above
+
+    def __getattr__(name: str) -> Any:
+        """Import a name on first access: the environment's options need no pandas."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        require("a recording", "agents", "pandas", "statsmodels")
+        from fusion_gym.recordings import fitting, recording
+
+        return getattr(recording, name, None) or getattr(fitting, name)

@@ -1,11 +1,14 @@
-"""The cells of a log's CSV file, and their times, numbers and even steps."""
+"""The cells of a log's CSV file, their times, numbers and even steps, and its error codes."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
+from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,6 +24,8 @@ _PHASE = 1e-3  # of an interval: a channel that reads later than the first by mo
 _FIRST, _LAST = 1678, 2261  # years that nanoseconds reach
 _SAMPLE = 200  # lines or rows that show the layout of a file
 _ROUND = 3600.0, 60.0, 10.0, 1.0, 0.1, 0.01, 1e-3, 1e-6, 1e-9  # seconds of round intervals
+_SHARE, _COUNT = 0.05, 3  # most readings and least count of an error code beside the known ones
+_CODES = {-127.0, 85.0, 32767.0, -32768.0, 65535.0, 6553.5, 3276.7, -3276.8, 327.67, -327.68}
 
 TIME_UNITS = {  # and their words in heads
     "excel": "excel.*", "s": "s|secs?|seconds?", "ms": "ms|milliseconds?",
@@ -356,3 +361,65 @@ def _phase(steps: Array) -> float:
     """Return the mean lateness of times, in (-1/2, 1/2] of a step; zero where they are uneven."""
     mean = np.exp(2j * np.pi * steps).mean() if len(steps) else 0.0
     return float(np.angle(mean)) / (2 * np.pi) if abs(mean) > 0.5 else 0.0
+
+
+def without_codes(
+    values: pd.DataFrame, codes: Sequence[float], source: str, remarks: list[str]
+) -> pd.DataFrame:
+    """Return the readings that are no error code."""
+    result = values.copy()
+    for name in values:
+        readings = values[name].dropna().to_numpy()
+        counts = [(code, int((readings == code).sum())) for code in codes]
+        known = [pair for pair in counts if pair[1]]
+        known += _error_codes(readings[~np.isin(readings, codes)])
+        result[name] = values[name].where(~values[name].isin([code for code, _ in known]))
+        remarks += [f"{name}: {count} readings of {code:g} are an error code: no reading"
+                    for code, count in known]  # fmt: skip
+        if result[name].isna().all():
+            raise ConfigurationError(
+                f"{source} is not allowed: its channel {name!r} has error codes alone"
+            )
+    for code in codes:
+        if not (values == code).to_numpy().any():
+            remarks.append(f"no reading is the error code {code:g}")
+    return result
+
+
+def _error_codes(values: Array) -> list[tuple[float, int]]:
+    """Return the error codes of readings (T,) in the order of time, with their counts.
+
+    A code is repeated exactly, farther from the other readings than their range, and reached and
+    left in one step. Where readings come near an extreme value and stay, it is a limit.
+    """
+    distinct, counts = np.unique(values, return_counts=True)
+    listed = np.array([_is_code(value) for value in distinct], bool)
+    bulk = values[np.isin(values, distinct[~listed])]
+    if len(bulk) < 0.5 * len(values) or not len(bulk):
+        return []
+    low, middle, high = np.quantile(bulk, (0.05, 0.5, 0.95))
+    far = np.abs(distinct - middle) > 1.5 * (high - low)
+    often = listed | ((counts >= _COUNT) & (counts <= _SHARE * len(values)))
+    rest, result = values[~np.isin(values, distinct[far & often])], list[tuple[float, int]]()
+    if not len(rest) or rest.min() == rest.max():
+        return []
+    low, high = np.quantile(rest, (0.001, 0.999))
+    for place in np.flatnonzero(far & often):
+        code, count, known = float(distinct[place]), int(counts[place]), listed[place]
+        gap = low - code if code < middle else code - high
+        between = int((np.abs(rest - code) < 0.75 * gap).sum())
+        lengths = [length for value, length in run_lengths(values) if value == code]
+        brief = known or (len(lengths) > 1 and np.mean(lengths) <= 10.0)
+        if gap > (0.5 if known else 1.0) * (high - low) and between <= 0.1 * count and brief:
+            result.append((code, count))
+    return result
+
+
+def _is_code(value: float) -> bool:
+    digits = f"{abs(value):.10g}".replace(".", "")
+    return value in _CODES or (len(digits) > 2 and set(digits) == {"9"})
+
+
+def run_lengths(values: Any) -> list[tuple[Any, int]]:
+    """Return the values of runs of equal entries, and their lengths."""
+    return [(value, len(list(same))) for value, same in groupby(np.asarray(values).tolist())]

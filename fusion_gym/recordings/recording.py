@@ -1,20 +1,19 @@
-"""A log of sensors as a table on even times, and its data card."""
+"""A log of sensors as a table on even times."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, display, refusal
-from fusion_gym.recordings import judging, reading
+from fusion_gym.recordings import reading
+from fusion_gym.recordings.card import ChannelCard, RecordedChannel, cards
 from fusion_gym.validation import LARGEST, number
 
 # Shipped logs by name: three made-up tanks, and a wind mast (from brightwind 2.7.0, MIT).
@@ -26,73 +25,6 @@ _HEAD = re.compile(
     r"(?P<name>[^\[\]]*?[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?"
     rf"(\s+(?P<low>{_LIMIT})?\.\.(?P<high>{_LIMIT})?)?"
 )
-_SATURATED = 0.01  # share of readings at an extreme value that is a limit
-_STUCK = 12  # equal readings in a row, at least, of a channel that is stuck
-_SPIKE = 12.0  # robust deviations of the changes between readings
-_AGREEMENT, _FAULTY = 0.95, 0.9  # correlations with the median of the peers
-
-
-@dataclass(frozen=True)
-class RecordedChannel:
-    """A channel of a recording: one sensor.
-
-    Args:
-        name: its name.
-        unit: unit of its readings; empty if unknown.
-        low: lowest reading, at which it saturates; minus infinity for none.
-        high: highest reading, at which it saturates; infinity for none.
-
-    Example:
-        >>> from fusion_gym.recordings import RecordedChannel
-        >>> RecordedChannel("humidity", "%", high=100.0).low
-        -inf
-    """
-
-    name: str
-    unit: str = ""
-    low: float = -np.inf
-    high: float = np.inf
-
-
-@dataclass(frozen=True)
-class ChannelCard:
-    """What a recording says about a channel.
-
-    Args:
-        channel: the channel, with its given or observed limits.
-        readings: number of readings.
-        missing: share of the steps without a reading.
-        every: median of the steps between two readings.
-        mean: mean of the readings, in the channel's unit.
-        deviation: standard deviation of the readings, in the channel's unit.
-        resolution: least difference of two different readings, in the channel's unit.
-        saturated: share of the readings at a limit.
-        stuck: share of the readings that repeat the one before for long.
-        spikes: readings far from both neighbours.
-        agreement: correlation with the median of the channels of its unit; NaN without two others.
-        fault: reason why the channel is not used; empty if it is.
-        change: least change, in the channel's unit, of a channel recorded on change; zero if it
-            is recorded at even times.
-
-    Example:
-        >>> from fusion_gym.recordings import Recording
-        >>> [card.fault for card in Recording.read("tanks").card]
-        ['', '', '']
-    """
-
-    channel: RecordedChannel
-    readings: int
-    missing: float
-    every: float
-    mean: float
-    deviation: float
-    resolution: float
-    saturated: float
-    stuck: float
-    spikes: int
-    agreement: float
-    fault: str = ""
-    change: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +107,9 @@ class Recording:
                     for place in keep]  # fmt: skip
         own = pd.DataFrame(numbers[:, keep], columns=[channel.name for channel in channels])
         values = reading.on_even_times(own, times, source, remarks)
-        return cls(_without_codes(values, codes, source, remarks), tuple(channels), tuple(remarks))
+        return cls(
+            reading.without_codes(values, codes, source, remarks), tuple(channels), tuple(remarks)
+        )
 
     @property
     def interval(self) -> pd.Timedelta:
@@ -185,16 +119,14 @@ class Recording:
     @property
     def gaps(self) -> tuple[int, pd.Timedelta]:
         """Number of gaps without any reading, and the time of the longest."""
-        silent = judging.run_lengths(self.values.isna().all(axis=1))
+        silent = reading.run_lengths(self.values.isna().all(axis=1))
         lengths = [length for value, length in silent if value]
         return len(lengths), max(lengths, default=0) * self.interval
 
     @property
     def card(self) -> tuple[ChannelCard, ...]:
         """The data card: a row for every channel."""
-        agreements = [self._agreement(place) for place in range(len(self.channels))]
-        same = judging.copies(self.values)
-        return tuple(self._card(place, agreements, same) for place in range(len(self.channels)))
+        return cards(self.values, self.channels)
 
     def select(self, names: Sequence[str] = (), share: float = 1.0) -> Recording:
         """Return some channels, by default all without a fault, with no readings at their limits.
@@ -257,56 +189,6 @@ class Recording:
             heads.append(c.name + f" [{c.unit}]" * bool(c.unit) + limits * (limits != " .."))
         self.values.set_axis(heads, axis=1).to_csv(path, index_label="time")
 
-    def _card(
-        self, place: int, agreements: Sequence[float], same: Mapping[str, str]
-    ) -> ChannelCard:
-        column = self.values.iloc[:, place]
-        readings = column.dropna()
-        values = readings.to_numpy()
-        distinct, counts = np.unique(values, return_counts=True)
-        channel = _with_limits(self.channels[place], distinct, counts)
-        saturated = (values <= channel.low) | (values >= channel.high)
-        same_values = judging.run_lengths(values)
-        free = [length for value, length in same_values if channel.low < value < channel.high]
-        long = max(_STUCK, 8.0 * float(np.mean(free or [1])))
-        stuck = sum(length for length in free if length >= long) / max(len(values), 1)
-        changes = np.diff(values)
-        usual = 1.4826 * np.median(np.abs(changes)) or changes.std() if changes.size else 0.0
-        size = np.abs(changes)
-        jumps = np.minimum(size[1:], size[:-1]) * (changes[1:] * changes[:-1] < 0.0)
-        agreement, others = agreements[place], [agreements[peer] for peer in self._peers(place)]
-        faults = {
-            "constant": len(distinct) == 1,
-            "stuck": stuck > 0.5,
-            "counts": judging.counts_up(values),
-            "wraps around": judging.wraps(values),
-            same.get(channel.name, ""): channel.name in same,
-            "disagrees with its peers": agreement < _FAULTY and np.median(others) >= _AGREEMENT,
-        }
-        every = float(np.median(np.diff(np.flatnonzero(column.notna())))) if changes.size else 0.0
-        several = len(distinct) > 1
-        return ChannelCard(
-            channel=channel, readings=len(values), missing=1.0 - len(values) / len(column),
-            every=every, mean=float(values.mean()), deviation=float(values.std()),
-            resolution=float(np.diff(distinct).min()) if several else 0.0,
-            saturated=float(saturated.mean()) if several else 0.0, stuck=stuck,
-            spikes=int((jumps > _SPIKE * usual).sum()), agreement=agreement,
-            fault=next((fault for fault, true in faults.items() if true), ""),
-            change=judging.reported_change(column.to_numpy()),
-        )  # fmt: skip
-
-    def _peers(self, place: int) -> list[int]:
-        unit = self.channels[place].unit
-        same = (other for other, channel in enumerate(self.channels) if channel.unit == unit)
-        return [other for other in same if other != place and unit]
-
-    def _agreement(self, place: int) -> float:
-        """Return the correlation with the median of the other channels of the unit."""
-        peers = self._peers(place)
-        if len(peers) < 2:
-            return float("nan")
-        return float(self.values.iloc[:, place].corr(self.values.iloc[:, peers].median(axis=1)))
-
 
 def _channel(head: str, source: str) -> RecordedChannel:
     match = _HEAD.fullmatch(" ".join(head.split()))
@@ -317,39 +199,3 @@ def _channel(head: str, source: str) -> RecordedChannel:
             "unit and rising limits, as in 'humidity [%] 0..100'"
         )
     return RecordedChannel(match["name"], match["unit"] or "", low, high)
-
-
-def _without_codes(
-    values: pd.DataFrame, codes: Sequence[float], source: str, remarks: list[str]
-) -> pd.DataFrame:
-    """Return the readings that are no error code."""
-    result = values.copy()
-    for name in values:
-        readings = values[name].dropna().to_numpy()
-        counts = [(code, int((readings == code).sum())) for code in codes]
-        known = [pair for pair in counts if pair[1]]
-        known += judging.error_codes(readings[~np.isin(readings, codes)])
-        result[name] = values[name].where(~values[name].isin([code for code, _ in known]))
-        remarks += [f"{name}: {count} readings of {code:g} are an error code: no reading"
-                    for code, count in known]  # fmt: skip
-        if result[name].isna().all():
-            raise ConfigurationError(
-                f"{source} is not allowed: its channel {name!r} has error codes alone"
-            )
-    for code in codes:
-        if not (values == code).to_numpy().any():
-            remarks.append(f"no reading is the error code {code:g}")
-    return result
-
-
-def _with_limits(
-    channel: RecordedChannel, distinct: Array, counts: NDArray[np.int64]
-) -> RecordedChannel:
-    """Return the channel with limits where many readings have an extreme value."""
-    if len(distinct) < 10:
-        return channel
-    often = max(_SATURATED * counts.sum(), 10.0 * float(np.median(counts)), 20.0)
-    low, high = channel.low, channel.high
-    low = float(distinct[0]) if low == -np.inf and counts[0] >= often else low
-    high = float(distinct[-1]) if high == np.inf and counts[-1] >= often else high
-    return RecordedChannel(channel.name, channel.unit, low, high)

@@ -13,9 +13,11 @@ from command_runs import call, refusal, succeed
 
 import fusion_gym
 from fusion_gym.commands import field
-from fusion_gym.evaluation import field_study, run_episodes
-from fusion_gym.evaluation.devices import fields_of, longest_interval, step_of
-from fusion_gym.evaluation.field_study import (
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.recordings import Recording, field_study, fit
+from fusion_gym.recordings.environment import WindowNoise
+from fusion_gym.recordings.field_report import fields_of, longest_interval, step_of
+from fusion_gym.recordings.field_study import (
     PRACTICE,
     FieldStudy,
     MethodPoint,
@@ -23,8 +25,6 @@ from fusion_gym.evaluation.field_study import (
     measure,
     point_of,
 )
-from fusion_gym.recordings import Recording, fit
-from fusion_gym.systems.tobit.recorded import WindowNoise
 from fusion_gym.validation import ConfigurationError
 
 STUDY = FieldStudy({}, rate=0.05, shape=(1.0, 1.0), horizon=50, source="normal")

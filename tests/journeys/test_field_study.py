@@ -10,9 +10,8 @@ from command_runs import refusal, succeed
 
 from fusion_gym.commands import field
 from fusion_gym.commands.field import AGENT
-from fusion_gym.evaluation import field_study
-from fusion_gym.evaluation.field_study import METHODS
-from fusion_gym.recordings import Recording
+from fusion_gym.recordings import Recording, field_study
+from fusion_gym.recordings.field_study import METHODS
 
 
 def test_a_study_ends_in_the_settings_of_devices(

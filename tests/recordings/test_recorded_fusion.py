@@ -19,8 +19,8 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.recordings import FittedPlant, Recording, fit
+from fusion_gym.recordings.environment import ResampledNoise
 from fusion_gym.recordings.fitting import deviations
-from fusion_gym.systems.tobit.recorded import ResampledNoise
 from fusion_gym.validation import ConfigurationError
 
 ENV = "fusion_gym/RecordedFusion-v1"

@@ -14,14 +14,14 @@ from fusion_gym import seeds
 ROWS = (
     "arrays declaration docstrings entries errors gaussian importing linalg lowering namespace "
     "option_file seeds validation version yaml_text",
-    "fusion recordings",
+    "fusion",
     "core",
     "systems",
     "envs solvers zoo",
     "jax policies",
     "evaluation configs",
     "output",
-    "training",
+    "training recordings",
     "commands",
 )
 FLOORS = {name: floor for floor, row in enumerate(ROWS) for name in row.split()}
@@ -89,6 +89,17 @@ def test_imports_run_downwards(module: str) -> None:
         if package == "systems" and other.startswith("fusion_gym.systems."):
             families = [name.split(".")[2] for name in (module, other) if name.count(".") > 2]
             assert len(set(families)) <= 1, f"{module} imports {other} of another family"
+
+
+def test_only_commands_of_logs_and_the_registration_know_recordings() -> None:
+    """The registration has the name of their environment, and imports it on its first use."""
+    users = {f"fusion_gym.commands.{name}" for name in ("field", "fit", "log_options")}
+    users |= {"fusion_gym.envs.registration"}
+    for module, path in modules().items():
+        texts = {path.read_text(), *imports(module)}
+        if any("fusion_gym.recordings" in text for text in texts):
+            inside = module.startswith(("fusion_gym.recordings", "agents."))
+            assert inside or module in users, module
 
 
 def test_there_are_no_circles() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import os
 from dataclasses import dataclass, fields, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
@@ -17,7 +16,6 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.options import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
-from fusion_gym.importing import require
 from fusion_gym.option_file import load_yaml
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import Truth
@@ -209,7 +207,6 @@ def _part(log: str, modified: float, names: tuple[str, ...] | None, share: float
 
 def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     """Return the scenario of these options."""
-    require("a recording", "agents", "pandas", "statsmodels")
     from fusion_gym.recordings import FittedPlant
     from fusion_gym.recordings.fitting import noisy_channels
 
@@ -262,11 +259,10 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
 
 def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:
     """Return the options with the made-up log and its plant."""
-    folder = Path(str(files("fusion_gym.recordings")))
     for name in _EXAMPLE:
         if getattr(choice, name) is not getattr(LinearFusionOptions, name):
             raise refusal(name, getattr(choice, name), "left out without a log")
-    options = load_yaml("system", folder / "tanks.yaml")
+    options = load_yaml("system", Path(__file__).with_name("tanks.yaml"))
     if choice.state_weights is not None:
         options["state_weights"] = choice.state_weights
     return replace(choice, log="tanks", **options)
