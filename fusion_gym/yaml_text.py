@@ -2,13 +2,15 @@
 
 import re
 from collections.abc import Hashable
+from pathlib import Path
 from typing import Any
 
-import yaml
-
 from fusion_gym.errors import ConfigurationError, refusal
-from fusion_gym.importing import refuse_code
-from fusion_gym.validation import CONTROL, LONGEST_YAML, MOST_ENTRIES, nested
+from fusion_gym.importing import refuse_code, require
+from fusion_gym.validation import CONTROL, LONGEST_YAML, MOST_ENTRIES, nested, read_text
+
+require("a file of options", "agents", "yaml")
+import yaml  # noqa: E402
 
 _CONTROL = re.compile(rf"(?![\t\n]){CONTROL}")  # line breaks and tabs are allowed
 _NUMBERS = {  # YAML 1.2: without sexagesimal 1:30 and octal 010, with 1e-3
@@ -70,3 +72,8 @@ def parsed(text: str, source: str) -> Any:
             raise refusal(f"{source}: {key}", part, "text without control characters")
     refuse_code(result, source)
     return result
+
+
+def load_yaml(field: str, path: Path) -> Any:
+    """Return the content of a YAML file."""
+    return parsed(read_text(field, path), f"{field} = {str(path)!r}")

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array, Lazy, merge_runs
 from fusion_gym.core.access import check_requests
-from fusion_gym.core.admission import require_finite
-from fusion_gym.core.beliefs import Owner
 from fusion_gym.core.estimator import Estimator, Reception
-from fusion_gym.core.memory import Memory
+from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Outcome, Runs, advance, start_of
 from fusion_gym.core.task import Task
+from fusion_gym.errors import DivergenceError
 
 # Normals in a block, of one run and of all runs (64 MB); a block has at least one step.
 _BLOCK_OF_RUN, _BLOCK = 2**11, 2**23
@@ -352,3 +351,14 @@ def _starts(source: NoiseSource, keys: list[tuple[int, int]], channels: int) -> 
         for place, key in enumerate(keys):
             noise[place] = source.start(*key, channels)
     return np.ascontiguousarray(noise.T)
+
+
+def require_finite(
+    values: Mapping[str, Array], finished: NDArray[np.bool_], steps: NDArray[np.int64]
+) -> None:
+    """Raise a ``DivergenceError`` if a value (…, N) of an unfinished run is not finite."""
+    for name, value in values.items():
+        lost = ~np.isfinite(value).reshape(-1, len(steps)).all(0) & ~finished
+        if lost.any():
+            run = int(lost.argmax())
+            raise DivergenceError(f"run {run}, step {steps[run]}: the {name} is not finite")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -26,7 +28,7 @@ _CHANNELS = {
     "true_drop_probability": ("independent",),
 }
 _LONGEST = 100  # steps of a delay
-_DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
+_DROP: dict[str, ArrayLike] = {"perfect": 0.0, "independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
 _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 
 
@@ -70,86 +72,88 @@ class Channel:
     lost with the probability of S(t). With one state, losses are independent.
 
     Args:
-        transition: (states, states), rows sum to 1.
-        drop: Loss probabilities (states, sensors).
-        initial: Distribution (states,) of S(0).
-        truth: Range (low, high) of the true probability of independent losses, of which each
-            episode draws; ``None`` is ``drop``.
+        options: The options.
+        sensors: Number of sensors.
+        channels: Number of channels of an assignment, of which every sensor has a link on each;
+            ``None`` is one channel of each sensor's own.
+
+    Raises:
+        ConfigurationError: A probability is outside [0, 1], a row of the transition does not sum to
+            1, the chain has no unique stationary law, or an option belongs to another channel.
 
     Source: Chakravorty and Mahajan, "Remote estimation over a packet-drop channel with Markovian
     state", IEEE Trans. Automatic Control 65, 2020, Section II.
     """
 
-    transition: Array
-    drop: Array
-    initial: Array
-    truth: tuple[float, float] | None = None
+    options: ChannelOptions
+    sensors: int
+    channels: int | None = None
 
-    @classmethod
-    def perfect(cls, sensors: int) -> Channel:
-        """Return a channel without losses."""
-        return cls(np.ones((1, 1)), np.zeros((1, sensors)), np.ones(1))
+    def __post_init__(self) -> None:
+        kind = self.options.channel
+        for name, kinds in _CHANNELS.items():
+            value = getattr(self.options, name)
+            given = value is not None and not (isinstance(value, str) and value == "stationary")
+            if given and kind not in kinds:
+                reason = f"it belongs to {' and '.join(map(repr, kinds))}"
+                raise forbidden(name, value, reason, f"with channel={kind!r}")
+        for part in ("transition", "drop", "initial", "truth"):
+            getattr(self, part)  # which checks it
 
-    @classmethod
-    def independent(
-        cls, drop_probability: ArrayLike, sensors: int, truth: ArrayLike | None = None
-    ) -> Channel:
-        """Return a channel with independent losses.
+    @cached_property
+    def transition(self) -> Array:
+        """Probabilities (states, states) from the last state (row) to the next."""
+        if self.options.channel != "gilbert_elliott":
+            return np.ones((1, 1))
+        matrix: ArrayLike | None = self.options.channel_transition
+        matrix = _TRANSITION if matrix is None else matrix
+        matrix = validation.array("channel_transition", matrix, (2, 2))
+        if np.any(matrix < 0.0) or not np.allclose(matrix.sum(1), 1.0, rtol=0.0, atol=1e-9):
+            reason = "it must have rows of probabilities that sum to 1"
+            raise forbidden("channel_transition", matrix, reason)
+        return matrix
 
-        Args:
-            drop_probability: One probability, or one per sensor.
-            sensors: Number of sensors.
-            truth: True probability, or a range (low, high) of which each episode draws.
+    @cached_property
+    def drop(self) -> Array:
+        """Loss probabilities (states, sensors · channels)."""
+        kind = self.options.channel
+        shape = (self.sensors,) if self.channels is None else (self.sensors, self.channels)
+        drop: ArrayLike | None = self.options.drop_probability
+        drop = _DROP[kind] if drop is None else drop
+        if kind != "gilbert_elliott":
+            drop = validation.by_row(drop, shape) if self.channels else drop
+            return _probabilities("drop_probability", drop, shape).reshape(1, -1)
+        if validation.array_shape(drop) != (2,):
+            allowed = "a pair of probabilities (bad, good)"
+            raise validation.refusal("drop_probability", drop, allowed)
+        pair = _probabilities("drop_probability", drop, (2,))
+        return np.repeat(pair[:, None], math.prod(shape), axis=1)
 
-        Raises:
-            ConfigurationError: A probability is outside [0, 1].
-        """
-        drop = _probabilities("drop_probability", drop_probability, (1, sensors))
+    @cached_property
+    def initial(self) -> Array:
+        """Distribution (states,) of S(0)."""
+        initial, matrix = self.options.initial_channel, self.transition
+        if len(matrix) == 1:
+            return np.ones(1)
+        if initial != "stationary":
+            return np.eye(2)[STATES.index(initial)]
+        leaves = matrix[[0, 1], [1, 0]]
+        if leaves.sum() == 0.0:
+            where = "with a channel that never changes"
+            raise validation.refusal("initial_channel", "stationary", "'bad' or 'good'", where)
+        return np.asarray(leaves[::-1] / leaves.sum())
+
+    @cached_property
+    def truth(self) -> tuple[float, float] | None:
+        """Range (low, high) of the true probability of a loss; ``None`` is :attr:`drop`."""
+        truth = self.options.true_drop_probability
         if truth is None:
-            return cls(np.ones((1, 1)), drop, np.ones(1))
+            return None
         low, high = _probabilities("true_drop_probability", truth, (2,)).tolist()
         if np.ndim(truth) > 0 and not low < high:
             allowed = "a number from 0 to 1, or such a pair (low, high), low < high"
             raise validation.refusal("true_drop_probability", truth, allowed)
-        return cls(np.ones((1, 1)), drop, np.ones(1), (low, high))
-
-    @classmethod
-    def gilbert_elliott(
-        cls,
-        transition: ArrayLike,
-        drop_probability: ArrayLike,
-        sensors: int,
-        initial: str = "stationary",
-    ) -> Channel:
-        """Return independent channels with the states bad and good, one channel per sensor.
-
-        Args:
-            transition: (2, 2), from the last state (row) to the next.
-            drop_probability: Loss probabilities (bad, good).
-            sensors: Number of sensors.
-            initial: State at time 0: ``"stationary"``, ``"bad"`` or ``"good"``.
-
-        Raises:
-            ConfigurationError: A probability is outside [0, 1], a row does not sum to 1, or the
-                chain has no unique stationary law.
-        """
-        matrix = validation.array("channel_transition", transition, (2, 2))
-        if np.any(matrix < 0.0) or not np.allclose(matrix.sum(1), 1.0, rtol=0.0, atol=1e-9):
-            reason = "it must have rows of probabilities that sum to 1"
-            raise forbidden("channel_transition", matrix, reason)
-        if validation.array_shape(drop_probability) != (2,):
-            allowed = "a pair of probabilities (bad, good)"
-            raise validation.refusal("drop_probability", drop_probability, allowed)
-        drop = _probabilities("drop_probability", drop_probability, (2,))
-        if initial == "stationary":
-            leaves = matrix[[0, 1], [1, 0]]
-            if leaves.sum() == 0.0:
-                where = "with a channel that never changes"
-                raise validation.refusal("initial_channel", "stationary", "'bad' or 'good'", where)
-            start = leaves[::-1] / leaves.sum()
-        else:
-            start = np.eye(2)[STATES.index(initial)]
-        return cls(matrix, np.repeat(drop[:, None], sensors, axis=1), start)
+        return low, high
 
     @property
     def states(self) -> int:
@@ -219,37 +223,6 @@ def _probabilities(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Arra
     if np.any(result > 1.0):
         raise validation.refusal(field, value, "between 0 and 1")
     return result
-
-
-def make_channel(
-    options: ChannelOptions, sensors: int, channels: int | None = None
-) -> Channel | None:
-    """Return the channel of the options; ``None`` loses nothing.
-
-    Args:
-        options: The options.
-        sensors: Number of sensors.
-        channels: Number of channels of an assignment.
-    """
-    kind = options.channel
-    for name, kinds in _CHANNELS.items():
-        value = getattr(options, name)
-        given = value is not None and not (isinstance(value, str) and value == "stationary")
-        if given and kind not in kinds:
-            reason = f"it belongs to {' and '.join(map(repr, kinds))}"
-            raise forbidden(name, value, reason, f"with channel={kind!r}")
-    if kind == "perfect":
-        return None
-    drop = _DROP[kind] if options.drop_probability is None else options.drop_probability
-    if channels is not None:
-        shape, sensors = (sensors, channels), sensors * channels
-        if kind == "independent":  # of one link for each pair
-            drop = validation.spread("drop_probability", validation.by_row(drop, shape), shape)
-            drop = drop.ravel()
-    if kind == "independent":
-        return Channel.independent(drop, sensors, options.true_drop_probability)
-    matrix = _TRANSITION if options.channel_transition is None else options.channel_transition
-    return Channel.gilbert_elliott(matrix, drop, sensors, options.initial_channel)
 
 
 def make_acknowledgement(options: ChannelOptions) -> float:

@@ -185,6 +185,62 @@ LOCAL_VARIANCE = Signal(
 )
 
 
+# Knowledge in a task with memory; without memory "scheduler" and "own" suffice.
+MEMORY_SIGNALS = (
+    Signal(
+        "belief_difference",
+        "scheduler_memory",
+        "(n, N)",
+        "x* − x̂, the scheduler's estimate minus the centre's without a transmission",
+    ),
+    Signal(
+        "transmission_value",
+        "scheduler_memory",
+        "(sensors, N)",
+        "v(m) = ‖x* − x̂‖² − E‖x* − x̂(m)‖², in weights of mean 1",
+    ),
+    Signal("own_difference", "own_memory", "(sensors, n, N)", "x* − x̂ of each sensor"),
+    Signal("own_value", "own_memory", "(sensors, N)", "v(m) of each sensor"),
+)
+NETWORK_SIGNALS = (
+    Signal(
+        "energy",
+        "centre",
+        "(sensors, N)",
+        "tokens that pay for a sensor's packets: its own with budget='sensor', or the shared ones",
+        "own",
+    ),
+    Signal(
+        "channel_state",
+        "centre",
+        "(sensors, N)",
+        "state of the channel at the step before: 0 bad, 1 good; (sensors, channels, N) with "
+        '`access="assignment"`',
+        "own",
+    ),
+    Signal(
+        "arrival_probability",
+        "centre",
+        "(sensors, N)",
+        "probability that a packet sent now arrives now, by the model, on the best channel",
+        "own",
+    ),
+    Signal(
+        "link_probability",
+        "centre",
+        "(sensors, channels, N)",
+        "probability that a packet sent now on this channel of an assignment arrives now",
+        "own",
+    ),
+)
+# For policies that plan, and for saved agents.
+PLANNING_SIGNALS = (
+    Signal("estimate", "scheduler", "a state", "the estimator's state"),
+    Signal("beliefs", "scheduler_memory", "beliefs", "the scheduler's belief of the state"),
+    Signal("own_beliefs", "own_memory", "beliefs", "each sensor's belief of the state"),
+)
+
+
 def common_signals(axes: str = "(sensors, m, N)", **meanings: str) -> tuple[Signal, ...]:
     """Return the signals that every estimator offers.
 

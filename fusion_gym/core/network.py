@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -25,7 +25,6 @@ from fusion_gym.core.channel import (
     Channel,
     ChannelOptions,
     make_acknowledgement,
-    make_channel,
     make_delay,
 )
 from fusion_gym.core.estimator import Reception
@@ -38,34 +37,44 @@ _MOST_CHANNELS = 64  # of an assignment to fewer sensors
 
 
 @dataclass(slots=True)
+class Draws:
+    """What a network draws for a step, which nobody knows before it; ``None`` is absent.
+
+    ``following`` (l, N), the channels' present state · ``lost`` (l, N) bool, whether a packet sent
+    now is lost · ``delay`` (l, N), its delay in steps · ``unreported`` (l, N) bool, whether its
+    sender does not learn if it arrives · ``frequency`` (l, N), its channel · ``harvest`` (l, N)
+    bool, the tokens that the sensors gain. With k channels for an assignment ``following`` and
+    ``lost`` have l·k rows, k adjacent ones for each sensor.
+    """
+
+    following: NDArray[np.int64] | None = None
+    lost: NDArray[np.bool_] | None = None
+    delay: NDArray[np.int64] | None = None
+    unreported: NDArray[np.bool_] | None = None
+    frequency: NDArray[np.int64] | None = None
+    harvest: NDArray[np.bool_] | None = None
+
+
+@dataclass(slots=True)
 class NetworkState:
     """The network of N runs before the requests of a step; l sensors, delays of at most D steps.
 
     ``tokens`` (N,), or (l, N) of each sensor's own bucket · ``queue`` (l, N), the place of each
-    sensor · ``admitted`` (l, N) bool, by the access rule · ``channel`` (l, N), the channels' state
-    at the step before, which is fed back · ``place`` (l, N), 0 for the largest discrepancy. Hidden
-    are ``following`` (l, N), the channels' present state, ``lost`` (l, N) bool, whether a packet
-    sent now is lost, ``frequency`` (l, N), its channel, ``delay`` (l, N), its delay in steps,
-    ``due`` (D, l, N), the delay of the packet that was sent 1, …, D steps ago, 0 without one,
-    ``true_drop`` (N,), the true probability of a loss, ``unreported`` (l, N) bool, whether the
-    sender of a packet does not learn if it arrives, and ``harvest`` (l, N) bool, the tokens that
-    the sensors gain. With k channels for an assignment ``channel``, ``following`` and ``lost`` have
-    l·k rows, k adjacent ones for each sensor. ``None`` is absent.
+    sensor · ``admitted`` (l, N) bool, the sensors with a reading that the access rule admits ·
+    ``channel`` (l, N), the channels' state at the step before, which is fed back, as
+    ``Draws.following`` · ``place`` (l, N), 0 for the largest discrepancy. Hidden are ``draws``,
+    ``due`` (D, l, N), the delay of the packet that was sent 1, …, D steps ago, 0 without one, and
+    ``true_drop`` (N,), the true probability of a loss. ``None`` is absent.
     """
 
     tokens: Array
     queue: Queue
     admitted: NDArray[np.bool_]
     channel: NDArray[np.int64] | None = None
-    following: NDArray[np.int64] | None = None
-    lost: NDArray[np.bool_] | None = None
-    delay: NDArray[np.int64] | None = None
+    place: NDArray[np.int64] | None = None
     due: NDArray[np.int64] | None = None
     true_drop: Array | None = None
-    unreported: NDArray[np.bool_] | None = None
-    place: NDArray[np.int64] | None = None
-    frequency: NDArray[np.int64] | None = None
-    harvest: NDArray[np.bool_] | None = None
+    draws: Draws = field(default_factory=Draws)
 
     @property
     def energy(self) -> Array:
@@ -94,6 +103,11 @@ class Delivery(NamedTuple):
     spent: Array
     reception: Reception
     supposed: NDArray[np.bool_] | None = None
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Packets (l, N) bool that arrive at once, as far as the sensors know."""
+        return self.reception.arrived if self.supposed is None else self.supposed
 
 
 @dataclass(frozen=True)
@@ -169,7 +183,8 @@ class Network:
     def channel(self) -> Channel | None:
         """Losses; ``None`` loses nothing."""
         channels = self.options.channels if self.rule.by_channel else None
-        return make_channel(self.options, self.sensors, channels)
+        channel = Channel(self.options, self.sensors, channels)
+        return None if self.options.channel == "perfect" else channel
 
     @cached_property
     def delay(self) -> tuple[float, ...]:
@@ -248,38 +263,33 @@ class Network:
         due = np.zeros((longest, self.sensors, runs), dtype=np.int64) if longest else None
         everyone = np.ones((self.sensors, runs), dtype=np.bool_)
         bucket = self.bucket
-        return NetworkState(
-            bucket.start(runs),
-            bucket.start_queue(runs),
-            everyone,
-            channel,
-            channel,
-            due=due,
-            true_drop=true_drop,
-        )
+        tokens, queue = bucket.start(runs), bucket.start_queue(runs)
+        draws = Draws(channel)
+        return NetworkState(tokens, queue, everyone, channel, None, due, true_drop, draws)
 
-    def advance(self, state: NetworkState, noise: Array, step: NDArray[np.int64]) -> NetworkState:
+    def advance(
+        self,
+        state: NetworkState,
+        noise: Array,
+        step: NDArray[np.int64],
+        readings: NDArray[np.bool_] | None = None,
+    ) -> NetworkState:
         """Return the state before the requests of the next step.
 
         Args:
             state: Any state.
             noise: Standard normals (noise_channels, N).
             step: Steps taken so far (N,).
+            readings: Sensors (l, N) with a reading, which may request; ``None`` is all.
         """
-        admitted, turn = state.admitted, self.rule.turn
+        admitted, turn = state.admitted if readings is None else readings, self.rule.turn
         if turn is not None:
-            admitted = np.arange(self.sensors)[:, None] == turn(self.sensors, step, noise)
+            own = np.arange(self.sensors)[:, None] == turn(self.sensors, step, noise)
+            admitted = own if readings is None else own & readings
         noise = noise[1:] if self.rule.random else noise
-        following = state.following
-        moved = NetworkState(
-            state.tokens,
-            state.queue,
-            admitted,
-            following,
-            following,
-            due=state.due,
-            true_drop=state.true_drop,
-        )
+        following = state.draws.following
+        draws = Draws(following)
+        moved = replace(state, admitted=admitted, channel=following, place=None, draws=draws)
         return self.draw(moved, noise) if len(noise) else moved
 
     def draw(self, state: NetworkState, noise: Array) -> NetworkState:
@@ -310,26 +320,18 @@ class Network:
             frequency = namespace(drawn).minimum(drawn, self.options.channels - 1)
         if self._harvests:
             harvest = ndtr(next(parts)) < self.bucket.rate
-        return replace(
-            state,
-            following=following,
-            lost=lost,
-            delay=delay,
-            unreported=unreported,
-            frequency=frequency,
-            harvest=harvest,
-        )
+        draws = Draws(following, lost, delay, unreported, frequency, harvest)
+        return replace(state, draws=draws)
 
     def grant(self, state: NetworkState, requests: NDArray[Any], runs: Any = slice(None)) -> Grants:
         """Return the grants for requests (l, R) of the R ``runs``."""
         check_requests(requests, self._channels * self.rule.by_channel)
         queue = state.queue[:, runs]
-        if self.rule.turn is not None:
-            requests = requests & state.admitted[:, runs]
+        requests = requests * state.admitted[:, runs]
         if self.rule.limited:
             place = queue if state.place is None else state.place[:, runs]
             requests = first_requests(requests, place, self.slots)
-        harvest = None if state.harvest is None else state.harvest[:, runs]
+        harvest = None if state.draws.harvest is None else state.draws.harvest[:, runs]
         return self.bucket.grant(state.tokens[..., runs], requests, queue, harvest)
 
     def deliver(
@@ -346,15 +348,16 @@ class Network:
         lost = self._lost(state, requests, granted)
         left = granted if lost is None else granted & ~lost
         if self.rule.contended:
-            frequency = 0 if state.frequency is None else state.frequency
+            frequency = 0 if state.draws.frequency is None else state.draws.frequency
             left = left & ~collisions(granted, frequency, self.options.channels)
         reception, due, supposed = Reception(left), state.due, None
         if self.acknowledgement < 1.0:
-            unreported = True if state.unreported is None else state.unreported
+            unreported = True if state.draws.unreported is None else state.draws.unreported
             supposed = granted & (left | unreported)
-        if due is not None and state.delay is not None:
-            due = np.concatenate(((left * state.delay)[None], due[:-1]))
-            reception = Reception(left & (state.delay == 0))
+        delay = state.draws.delay
+        if due is not None and delay is not None:
+            due = np.concatenate(((left * delay)[None], due[:-1]))
+            reception = Reception(left & (delay == 0))
         if reads_silence:
             before = state.tokens if self.bucket.sharing == "equal" else state.tokens - spent
             possible = state.admitted & self.bucket.affordable(before)
@@ -363,15 +366,8 @@ class Network:
             arrival = self.link_probability(state)
             failure = None if arrival is None else 1.0 - arrival[:, 0]
             reception = reception._replace(possible=possible, failure=failure)
-        moved = NetworkState(
-            tokens,
-            queue,
-            state.admitted,
-            state.channel,
-            state.following,
-            due=due,
-            true_drop=state.true_drop,
-        )
+        draws = Draws(state.draws.following)
+        moved = replace(state, tokens=tokens, queue=queue, place=None, due=due, draws=draws)
         return moved, Delivery(granted, spent, reception, supposed)
 
     def _lost(
@@ -379,12 +375,13 @@ class Network:
     ) -> NDArray[np.bool_] | None:
         """Return whether a packet (l, N) on its channel is lost; ``None`` if none is."""
         probability = self.link_probability(state) if self.rule.by_channel else None
-        if state.lost is None or probability is None:
-            return state.lost
+        drawn = state.draws.lost
+        if drawn is None or probability is None:
+            return drawn
         if requests.dtype == np.bool_:
             requests = assign(granted, state.queue, probability)
         sensor, run = np.ogrid[: self.sensors, : requests.shape[1]]
-        lost: NDArray[np.bool_] = state.lost.reshape(probability.shape)
+        lost: NDArray[np.bool_] = drawn.reshape(probability.shape)
         return lost[sensor, requests - 1, run]
 
     def late(self, state: NetworkState) -> NDArray[np.bool_] | None:

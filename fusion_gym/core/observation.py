@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.channel import STATES
 from fusion_gym.core.knowledge import Block, Knowledge, covers, numbered
-from fusion_gym.core.memory import Owner
+from fusion_gym.core.memory import Beliefs, Owner
 from fusion_gym.core.task import Task
 from fusion_gym.namespace import namespace
 from fusion_gym.validation import ConfigurationError

@@ -6,6 +6,7 @@ Both halves make new arrays and change none, so runs can branch on other noise.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,11 +15,10 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs, take_runs, value_of
 from fusion_gym.core.access import discrepancy, place_of
-from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Signals
-from fusion_gym.core.memory import Memory
-from fusion_gym.core.network import NetworkState
+from fusion_gym.core.memory import Beliefs, Estimate, Memory
+from fusion_gym.core.network import Delivery, NetworkState
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
@@ -72,6 +72,7 @@ class State(NamedTuple):
             ``None`` if they know.
         history: For late packets, the estimator's state before the update, the measurements and the
             arrivals (sensors, N) of the last steps, oldest first.
+        known: States (n, N) whose truth is known, for the error; ``None`` is all.
     """
 
     plant: Any
@@ -79,6 +80,7 @@ class State(NamedTuple):
     network: NetworkState
     supposed: Any = None
     history: tuple[tuple[Any, Array, NDArray[np.bool_]], ...] = ()
+    known: NDArray[np.bool_] | None = None
 
 
 class Position(NamedTuple):
@@ -147,59 +149,31 @@ class Runs:
 
     def deliver(self, requests: NDArray[Any]) -> Outcome:
         """Make the first half of a step with requests (sensors, N): grant, update, fuse, reward."""
-        task, state, estimator = self.task, self.state, self.task.estimator
-        available, requested = task.plant.available(state.plant), requests > 0
-        if available is not None:
-            requests = requests * available[0]
-        network, delivery = task.network.deliver(state.network, requests, estimator.reads_silence)
-        (arrived, possible, failure), spent = delivery.reception, delivery.spent
-        if available is not None and possible is not None:
-            possible = possible & available[0]
-        history = state.history
-        if network.due is not None:
-            last = state.estimate, task.plant.measurement(state.plant), arrived
-            history = (*history, last)[-len(network.due) :]
-        estimate = estimator.update(state.estimate, Reception(arrived, possible, failure))
-        supposed, known = state.supposed, delivery.supposed
-        if known is not None:
-            supposed = estimator.update(supposed, Reception(known))
-        if task.options.packet == "estimate":
-            best, spread = self.beliefs().best
-            estimate = estimator.adopt(estimate, best[0], spread[0], np.asarray(arrived.any(0)))
-        self.memory.update(self.beliefs, arrived if known is None else known)
+        task, state, requested = self.task, self.state, requests > 0
+        silence = task.estimator.reads_silence
+        network, delivery = task.network.deliver(state.network, requests, silence)
+        after = receive(task, state, delivery, self.beliefs)._replace(network=network)
+        self.memory.update(self.beliefs, delivery.known)
+        self._delivered = after
+        estimator, estimate, spent = task.estimator, after.estimate, delivery.spent
         error = task.plant.truth(state.plant) - estimator.mean(estimate)
-        if available is not None:
-            error = np.where(available[1], error, 0.0)
-        squared_error = error * error
-        covariance = estimator.covariance(estimate)
-        reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
-        self._delivered = State(state.plant, estimate, network, supposed, history)
-        late = task.network.late(network)
+        if state.known is not None:
+            error = np.where(state.known, error, 0.0)
+        covariance, square = estimator.covariance(estimate), error * error
+        error_term, token_term = task.reward.terms(error, covariance, spent, self.price)
+        arrived, late = delivery.reception.arrived, task.network.late(network)
+        arrived = arrived if late is None else arrived | late.any(0)
+        diverged = namespace(square).logical_not(square <= task.divergence_level).any(0)
         self.steps = self.steps + 1
-        return Outcome(
-            reward=reward_error + reward_communication,
-            reward_error=reward_error,
-            reward_communication=reward_communication,
-            cost=spent,
-            requested=requested,
-            granted=delivery.granted,
-            arrived=arrived if late is None else arrived | late.any(0),
-            error=error,
-            squared_error=squared_error,
-            diverged=namespace(squared_error)
-            .logical_not(squared_error <= task.divergence_level)
-            .any(0),
-            ended=self.steps >= self.limit,
-        )
+        flags, total = (requested, delivery.granted, arrived), error_term + token_term
+        ended = self.steps >= self.limit
+        return Outcome(total, error_term, token_term, spent, *flags, error, square, diverged, ended)
 
     def answer(
         self, requests: NDArray[Any], runs: NDArray[np.int64] | slice = slice(None)
     ) -> Grants:
         """Return the grants for requests (sensors, R) of the R ``runs``."""
-        state, available = self.state, self.task.plant.available(self.state.plant)
-        if available is not None:
-            requests = requests * available[0][:, runs]
-        return self.task.network.grant(state.network, requests, runs)
+        return self.task.network.grant(self.state.network, requests, runs)
 
     def sense(self, noise: Array) -> None:
         """Make the second half of a step: move plant and network, measure, predict and observe.
@@ -257,9 +231,7 @@ class Runs:
 
     def admitted(self) -> NDArray[np.bool_]:
         """Return the sensors (sensors, N) with a reading that the access rule now admits."""
-        available = self.task.plant.available(self.state.plant)
-        admitted = self.state.network.admitted
-        return admitted if available is None else admitted & available[0]
+        return self.state.network.admitted
 
     def channel_state(self) -> NDArray[np.int64]:
         """Return the signal ``channel_state``, 0 without states."""
@@ -300,7 +272,7 @@ class Runs:
         ``price`` (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor
         granted least recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N)
         bool, ``observation`` (N, entries), ``estimate`` (the estimator's state), and the channels
-        and beliefs of :mod:`fusion_gym.core.signals`. Policies of single sensors read what these
+        and beliefs of :mod:`fusion_gym.core.knowledge`. Policies of single sensors read what these
         suppose.
         """
         nodes = None if self.state.supposed is None else self._signals(local=True)
@@ -388,9 +360,10 @@ def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) ->
         else task.estimator.observe(task.estimator.predict(known), task.plant.measurement(plant))
         for known in (state.estimate, state.supposed)
     )
-    network = task.network.advance(state.network, noise[own:], steps)
+    readings, known = task.plant.available(plant) or (None, None)
+    network = task.network.advance(state.network, noise[own:], steps, readings)
     network = rank_requests(task, network, estimate if supposed is None else supposed)
-    return State(plant, estimate, network, supposed, state.history)
+    return State(plant, estimate, network, supposed, state.history, known)
 
 
 def rank_requests(task: Task, state: NetworkState, known: Any) -> NetworkState:
@@ -399,6 +372,28 @@ def rank_requests(task: Task, state: NetworkState, known: Any) -> NetworkState:
         return state
     size = discrepancy(task.estimator.read(known), task.options.discrepancy)
     return replace(state, place=place_of(task.network.weights * size, state.queue))
+
+
+def receive(task: Task, state: State, delivery: Delivery, beliefs: Callable[[], Beliefs]) -> State:
+    """Return the states after the packets that arrive at once, and what the sensors suppose.
+
+    Args:
+        task: The task.
+        state: States before the requests.
+        delivery: The network's response.
+        beliefs: Function that returns the beliefs before the transmission.
+    """
+    estimator, arrived, history = task.estimator, delivery.reception.arrived, state.history
+    if task.delayed:
+        last = state.estimate, task.plant.measurement(state.plant), arrived
+        history = (*history, last)[1 - len(task.network.delay) :]
+    estimate, supposed = estimator.update(state.estimate, delivery.reception), state.supposed
+    if delivery.supposed is not None:
+        supposed = estimator.update(supposed, Reception(delivery.supposed))
+    if task.options.packet == "estimate":
+        best, spread = beliefs().best
+        estimate = estimator.adopt(estimate, best[0], spread[0], np.asarray(arrived.any(0)))
+    return state._replace(estimate=estimate, supposed=supposed, history=history)
 
 
 def settle(task: Task, state: State) -> State:

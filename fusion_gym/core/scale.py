@@ -16,8 +16,7 @@ from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.network import Network
-from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, DivergenceError, display, forbidden
 

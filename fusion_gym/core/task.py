@@ -3,26 +3,154 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fusion_gym import validation
+from fusion_gym import declaration, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.action import ACTIONS, Action, Single
-from fusion_gym.core.admission import admit
+from fusion_gym.core.action import ACTIONS, Action, ActionOptions, Sets, Single
 from fusion_gym.core.estimator import Estimator
-from fusion_gym.core.knowledge import INFORMATION_MODES, Knowledge, covers, least_covering
-from fusion_gym.core.nature import Nature
-from fusion_gym.core.network import Network, warn_of_uneven_grants
-from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.plant import Plant
-from fusion_gym.core.reward import Reward, reward_weights
-from fusion_gym.declaration import NumpyOnly, marked, plain_options
-from fusion_gym.entries import Options
+from fusion_gym.core.knowledge import (
+    INFORMATION_MODES,
+    Knowledge,
+    ObservationOptions,
+    covers,
+    least_covering,
+)
+from fusion_gym.core.network import Network, NetworkOptions, warn_of_uneven_grants
+from fusion_gym.core.noise import NoiseSource
+from fusion_gym.core.plant import Nature, Plant, TruthOptions, admit
+from fusion_gym.core.reward import Reward, RewardOptions, reward_weights
+from fusion_gym.declaration import NumpyOnly, OptionGroup, marked, plain_options
+from fusion_gym.entries import Arguments, Options
 from fusion_gym.errors import forbidden, refusal
+from fusion_gym.fusion.table import Structure
+
+Broadcast = Literal["none", "estimate", "packets"]
+
+
+@dataclass(frozen=True)
+class CommunicationOptions(OptionGroup):
+    """The options of packets, broadcasts and memory."""
+
+    packet: Literal["measurement", "estimate"] = "measurement"
+    """Content of a packet. ``"measurement"`` is the sensor's measurement or its node's estimate.
+    ``"estimate"`` is the centralised scheduler's estimate with its covariance and needs
+    ``memory=True``."""
+    broadcast: Broadcast | None = None
+    """Broadcast to every node besides tokens and price: ``"none"``, ``"estimate"`` (the fusion
+    centre's prediction with its covariance) or ``"packets"`` (every delivered packet). The default
+    is ``"estimate"`` where the centre feeds its estimate back, and otherwise ``"none"``."""
+    memory: bool = False
+    """Whether the centralised scheduler, or each local sensor, filters the measurements that were
+    not sent."""
+    memory_filter: str | None = None
+    """Filter of the memory, a value of the option ``filter``. The default is the fusion centre's
+    filter, or a better one where that filter minimises a bound."""
+
+
+@dataclass(frozen=True)
+class CommonOptions(
+    TruthOptions,
+    RewardOptions,
+    ActionOptions,
+    ObservationOptions,
+    CommunicationOptions,
+    NetworkOptions,
+):
+    """Declare the options of every environment; each environment sets its own defaults.
+
+    A field declares an option by its type, its default and the docstring below it. Validation,
+    ``help``, the specification and the documentation read this declaration. A value outside a
+    ``Literal`` or ``bool`` type raises an error at construction.
+
+    Attributes:
+        filters: Class of each value of an option ``filter``; its docstring declares the value.
+        structure: Correlation structure, which decides the values of an option ``fusion``.
+
+    Raises:
+        ConfigurationError: A value is not allowed.
+
+    Example:
+        >>> from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
+        >>> options = TobitOscillatorOptions(horizon=50, access="single")
+        >>> options.horizon, options.access, options.information
+        (50, 'single', 'sensors')
+    """
+
+    filters: ClassVar[Mapping[str, type]] = {}
+    structure: ClassVar[Structure | None] = None
+
+    def __post_init__(self) -> None:
+        if str(self.information) == "local":
+            calls = "fusion_gym.parallel_env(id) and make_sb3_vec_env(id, n, local=True)"
+            allowed = f"'sensors' or 'centre'; for decentralised sensors use {calls}"
+            raise refusal("information", "local", allowed)
+        super().__post_init__()
+
+    def nominal(self) -> Self:
+        """Return the options that scale the reward: plant, sensors and network."""
+        scaling = declaration.marked(CommonOptions, declaration.Scaling)
+        common = (item.name for item in fields(CommonOptions) if item.name not in scaling)
+        plain = {name: getattr(type(self), name) for name in common}
+        plain["reward_scale"] = None if self.reward_scale is None else 1.0
+        return replace(self, **plain)
+
+
+@dataclass(frozen=True)
+class PaperOptions(CommonOptions):
+    """Options of an environment whose reward scales by the error without transmissions."""
+
+    reward_scale: float | Literal["auto"] | None = None
+    cost_weight: float | Literal["random"] = 0.01
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """The parts and the defaults that an environment builds from its options.
+
+    Args:
+        options: The options.
+        plant: The truth and its sensors.
+        estimator: The local filters and the fusion centre.
+        state_weights: Weights (n,) of the squared errors in the reward if the options have none;
+            ``None`` weighs all states equally. ``reward_scale`` multiplies them.
+        policy_defaults: Parameters of named policies in this scenario.
+        feedback: Whether every node receives the centre's estimate by construction.
+        memory_estimator: Estimator of the unsent measurements; ``None`` is ``estimator``.
+        nodes_have_memory: Whether a packet holds all past measurements of its node, so that no
+            ``memory_estimator`` is needed.
+        no_estimates: Reason why a packet cannot hold an estimate, or ``None``.
+        required_policy: The policy whose silence the filter reads, or ``None``.
+        noise: Source of the plant's noise; ``None`` draws standard normals.
+        error: Function of errors and covariances in place of the option ``error``.
+
+    Example:
+        >>> import fusion_gym
+        >>> task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
+        >>> options = fusion_gym.CommonOptions()
+        >>> scenario = fusion_gym.Scenario(options, task.plant, task.estimator)
+        >>> scenario.feedback
+        False
+    """
+
+    options: CommonOptions
+    plant: Plant[Any]
+    estimator: Estimator[Any]
+    state_weights: ArrayLike | None = None
+    policy_defaults: dict[str, Arguments] = field(default_factory=dict)
+    feedback: bool = False
+    memory_estimator: Estimator[Any] | None = None
+    nodes_have_memory: bool = False
+    no_estimates: str | None = None
+    required_policy: str | None = None
+    noise: NoiseSource | None = None
+    error: Callable[[Array, Array], Any] | None = None
+
 
 # Additional signals that need the sensors' measurements.
 SENSORS_ONLY = (
@@ -60,8 +188,8 @@ class Task(Scenario):
 
     def __post_init__(self) -> None:
         for name, applies, *texts in EXCLUSIONS:
-            if applies(self, self.options):
-                reason, where = (text.format(task=self) for text in texts)
+            if applies(self):
+                where, reason = (text.format(task=self) for text in texts)
                 raise forbidden(name, getattr(self.options, name), reason, where)
 
     @classmethod
@@ -89,17 +217,15 @@ class Task(Scenario):
             nature.refuse("here", f"the truth of {type(plant).__name__} is its model")
         horizon = validation.horizon(options.horizon)
         weights = reward_weights(options, scenario.state_weights, admit(plant, horizon))
-        memory = None
-        if options.memory:
-            known = None if scenario.nodes_have_memory else estimator
-            memory = scenario.memory_estimator or known
-        network = Network(options, plant.sensor_count)
-        warn_of_uneven_grants(network)
-        if options.memory_filter is not None and options.memory and not scenario.memory_estimator:
+        memory = scenario.memory_estimator
+        if options.memory_filter is not None and options.memory and memory is None:
             allowed = "None here, because this system has one filter"
             raise refusal("memory_filter", options.memory_filter, allowed)
+        if memory is None and not scenario.nodes_have_memory:
+            memory = estimator
+        warn_of_uneven_grants(Network(options, plant.sensor_count))
         values: Options = {name.name: getattr(scenario, name.name) for name in fields(scenario)}
-        values |= {"state_weights": weights, "memory_estimator": memory}
+        values |= {"state_weights": weights, "memory_estimator": memory if options.memory else None}
         task = cls(**values, nominal_error=nominal_error, limit=limit)
         task.reward  # noqa: B018  which checks it
         return task
@@ -232,13 +358,8 @@ class Task(Scenario):
             raise refusal("error", self.reward.error_kind, "a kind", "under JAX")
 
 
-class Exclusion(NamedTuple):
-    """An option whose value other options or parts exclude; the texts may name the task's parts."""
-
-    option: str
-    applies: Callable[[Task, CommonOptions], bool]
-    reason: str
-    where: str = "here"
+def _unacknowledged(task: Task) -> bool:
+    return task.network.acknowledgement < 1.0
 
 
 def _loses(task: Task) -> bool:
@@ -246,112 +367,63 @@ def _loses(task: Task) -> bool:
     return task.network.rule.contended or (channel is not None and channel.loses)
 
 
-EXCLUSIONS = (
-    Exclusion(
-        "information",
-        lambda task, options: bool(task.required_policy) and options.information == "centre",
-        "it must be 'sensors'",
-        "with the policy {task.required_policy!r}, which reads the new measurements",
-    ),
-    Exclusion(
-        "action",
-        lambda task, options: (
-            options.action == "discrete"
-            and options.access != "single"
-            and task.sensors > _MOST_DISCRETE
-        ),
-        f"it numbers all sets of requests, so it allows at most {_MOST_DISCRETE} sensors",
-        "with {task.sensors} sensors",
-    ),
-    Exclusion(
-        "action",
-        lambda task, options: options.action == "assignment" and not task.network.rule.by_channel,
-        "it needs access='assignment'",
-        "with access={task.options.access!r}",
-    ),
-    Exclusion(
-        "memory",
-        lambda task, options: options.memory and options.information == "centre",
-        "it must be False, because the centre stores only deliveries",
-        "with information='centre'",
-    ),
-    Exclusion(
-        "memory_filter",
-        lambda task, options: options.memory_filter is not None and not options.memory,
-        "it must be None unless memory=True",
-    ),
-    Exclusion(
-        "belief_features",
-        lambda task, options: bool(task.belief_features) and options.information == "centre",
-        "it must be None or empty",
-        "with information='centre'",
-    ),
-    Exclusion(
-        "broadcast",
-        lambda task, options: task.broadcast == "none" and task.feedback,
-        "it must be 'estimate' or 'packets', because the nodes receive the centre's estimate",
-    ),
-    Exclusion(
-        "packet",
-        lambda task, options: options.packet == "estimate" and not options.memory,
-        "it must be 'measurement', because an estimate needs memory=True",
-    ),
-    Exclusion(
-        "packet",
-        lambda task, options: options.packet == "estimate" and task.no_estimates is not None,
-        "it must be 'measurement', because {task.no_estimates}",
-    ),
-    Exclusion(
-        "packet",
-        lambda task, options: (
-            options.packet == "estimate" and type(task.estimator).adopt is Estimator.adopt
-        ),
-        "it must be 'measurement', because this system's centre cannot continue from a delivered "
-        "estimate",
-    ),
-    Exclusion(
-        "delay",
-        lambda task, options: task.delayed and options.packet == "estimate",
-        "a late estimate cannot join what arrived before it",
-        "with packet='estimate'",
-    ),
-    Exclusion(
-        "delay",
-        lambda task, options: task.delayed and task.estimator.reads_silence,
-        "a step without an arrival may be no silence",
-        "with this filter",
-    ),
-    Exclusion(
-        "delay",
-        lambda task, options: task.delayed and "value" in task.belief_features,
-        ONE_STEP,
-        "with belief_features='value'",
-    ),
-    Exclusion(
-        "access",
-        lambda task, options: (
-            (task.network.rule.contended or task.network.rule.by_channel)
-            and task.estimator.reads_silence
-        ),
-        "it must be without shared channels, because a collision or a loss there is no silence",
-    ),
-    Exclusion(
-        "acknowledgements",
-        lambda task, options: task.network.acknowledgement < 1.0 and not _loses(task),
-        "it must be 'perfect', because no packet is lost",
-    ),
-    Exclusion(
-        "acknowledgements",
-        lambda task, options: task.network.acknowledgement < 1.0 and task.broadcast != "none",
-        "it must be 'perfect', because broadcast={task.broadcast!r} acknowledges what arrives",
-    ),
-    Exclusion(
-        "acknowledgements",
-        lambda task, options: (
-            task.network.acknowledgement < 1.0
-            and (not task.estimator.independent_nodes or task.estimator.reads_silence)
-        ),
-        "it must be 'perfect', because a sensor's innovation needs the packets of all sensors that "
-        "arrived",
-    ),
+def _shared(task: Task) -> bool:
+    return task.network.rule.contended or task.network.rule.by_channel
+
+
+def _estimates(task: Task) -> bool:
+    return task.options.packet == "estimate"
+
+
+def _central(task: Task) -> bool:
+    return task.options.information == "centre"
+
+
+# Options that other options or parts exclude: the option, when, where, and the reason, in texts
+# that may name the task's parts.
+# fmt: off
+EXCLUSIONS: tuple[tuple[str, Callable[[Task], Any], str, str], ...] = (
+    ("information", lambda task: _central(task) and task.required_policy,
+     "with the policy {task.required_policy!r}, which reads the new measurements",
+     "it must be 'sensors'"),
+    ("action", lambda task: type(task.action) is Sets and task.sensors > _MOST_DISCRETE,
+     "with {task.sensors} sensors",
+     f"it numbers all sets of requests, so it allows at most {_MOST_DISCRETE} sensors"),
+    ("action",
+     lambda task: task.options.action == "assignment" and not task.network.rule.by_channel,
+     "with access={task.options.access!r}", "it needs access='assignment'"),
+    ("memory", lambda task: _central(task) and task.options.memory,
+     "with information='centre'", "it must be False, because the centre stores only deliveries"),
+    ("memory_filter",
+     lambda task: task.options.memory_filter is not None and not task.options.memory,
+     "here", "it must be None unless memory=True"),
+    ("belief_features", lambda task: _central(task) and task.belief_features,
+     "with information='centre'", "it must be None or empty"),
+    ("broadcast", lambda task: task.feedback and task.broadcast == "none", "here",
+     "it must be 'estimate' or 'packets', because the nodes receive the centre's estimate"),
+    ("packet", lambda task: _estimates(task) and not task.options.memory, "here",
+     "it must be 'measurement', because an estimate needs memory=True"),
+    ("packet", lambda task: _estimates(task) and task.no_estimates, "here",
+     "it must be 'measurement', because {task.no_estimates}"),
+    ("packet", lambda task: _estimates(task) and type(task.estimator).adopt is Estimator.adopt,
+     "here", "it must be 'measurement', because this system's centre cannot continue from a "
+     "delivered estimate"),
+    ("delay", lambda task: task.delayed and _estimates(task), "with packet='estimate'",
+     "a late estimate cannot join what arrived before it"),
+    ("delay", lambda task: task.delayed and task.estimator.reads_silence, "with this filter",
+     "a step without an arrival may be no silence"),
+    ("delay", lambda task: task.delayed and "value" in task.belief_features,
+     "with belief_features='value'", ONE_STEP),
+    ("access", lambda task: _shared(task) and task.estimator.reads_silence, "here",
+     "it must be without shared channels, because a collision or a loss there is no silence"),
+    ("acknowledgements", lambda task: _unacknowledged(task) and not _loses(task), "here",
+     "it must be 'perfect', because no packet is lost"),
+    ("acknowledgements", lambda task: _unacknowledged(task) and task.broadcast != "none", "here",
+     "it must be 'perfect', because broadcast={task.broadcast!r} acknowledges what arrives"),
+    ("acknowledgements",
+     lambda task: _unacknowledged(task)
+     and (not task.estimator.independent_nodes or task.estimator.reads_silence), "here",
+     "it must be 'perfect', because a sensor's innovation needs the packets of all sensors that "
+     "arrived"),
 )
+# fmt: on

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signals
+from fusion_gym.core.memory import Beliefs, Owner
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.diagonal import orthonormalise
@@ -191,9 +191,8 @@ class _Step(NamedTuple):
 def _normalised_error(step: _Step) -> Array:
     """Return eᵀ P⁺ e over the rank of P (N,), of the known truths alone."""
     error, covariance = step.outcome.error, step.covariance
-    available = step.batch.task.plant.available(step.batch.delivered.plant)
-    if available is not None:
-        known = available[1]
+    known = step.batch.delivered.known
+    if known is not None:
         covariance = np.where(known[:, None] & known, covariance, np.eye(len(known))[..., None])
         error = error * np.sqrt(len(known) / np.maximum(known.sum(0), 1))
     result = linalg.dot(error, linalg.solve_vector(covariance, error)) / len(error)

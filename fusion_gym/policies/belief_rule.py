@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.knowledge import Knowledge, Signals
-from fusion_gym.core.memory import Owner
+from fusion_gym.core.memory import Beliefs, Owner
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import SensorView
 from fusion_gym.policies.base import Rule, parameter

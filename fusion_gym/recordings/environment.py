@@ -14,9 +14,8 @@ from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
-from fusion_gym.core.options import Scenario
+from fusion_gym.core.task import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
-from fusion_gym.option_file import load_yaml
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import Truth
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
@@ -262,6 +261,8 @@ def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:
     for name in _EXAMPLE:
         if getattr(choice, name) is not getattr(LinearFusionOptions, name):
             raise refusal(name, getattr(choice, name), "left out without a log")
+    from fusion_gym.yaml_text import load_yaml
+
     options = load_yaml("system", Path(__file__).with_name("tanks.yaml"))
     if choice.state_weights is not None:
         options["state_weights"] = choice.state_weights

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.channel import Channel
+from fusion_gym.core.channel import Channel, ChannelOptions
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.single import iterate_values
 from fusion_gym.systems.remote.vector import VectorSources
@@ -54,7 +54,7 @@ def age_sources(task: Task, longest: int = _LONGEST) -> tuple[AgeSource, ...]:
     model, network = task.plant, task.network
     if not isinstance(model, VectorSources):
         raise validation.refusal("sources", None, "vector sources", "for costs by age")
-    channel = network.channel or Channel.perfect(task.sensors)
+    channel = network.channel or Channel(ChannelOptions(), task.sensors)
     weights = model.blocks(task.reward.error_weight * task.reward.state_weights)[..., 0]
     covariance, costs = model.posterior, []
     for _ in range(longest + _BEYOND):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.channel import Channel
+from fusion_gym.core.channel import Channel, ChannelOptions
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import AverageSolution, FiniteSolution, solve_average, solve_finite
@@ -65,7 +65,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
         raise validation.refusal("error", reward.error_kind, "'squared'", "for the optimum")
     if reward.price.fixed is None:
         raise validation.refusal("cost_weight", "random", "a number", "for the optimum")
-    channel = channel or Channel.perfect(task.sensors)
+    channel = channel or Channel(ChannelOptions(), task.sensors)
     weights = reward.error_weight * reward.state_weights[:, 0]
     return tuple(
         SourceProblem.create(

@@ -12,11 +12,10 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import CommonOptions
+from fusion_gym.core.task import CommonOptions
 from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.namespace import namespace, take
-from fusion_gym.option_file import load_yaml
 
 _NAME, _END = "schedule", "end"
 _ENDS = ("repeat", "hold")
@@ -80,6 +79,8 @@ def read_schedule(value: Any) -> dict[str, Any] | None:
     """
     path = Path(value if isinstance(value, str) else "")
     if path.suffix in (".yaml", ".yml"):
+        from fusion_gym.yaml_text import load_yaml
+
         value = load_yaml(_NAME, path)
     elif path.suffix == ".npz":
         try:

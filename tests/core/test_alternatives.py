@@ -8,12 +8,17 @@ import pytest
 from training_configs import small_config
 
 import fusion_gym
-from fusion_gym.core.alternatives import Alternatives, alternatives
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.runs import Branch
 from fusion_gym.core.task import Task
-from fusion_gym.envs.privileged import PrivilegedVecEnv, make_sb3_vec_env, reference_estimator
+from fusion_gym.envs.privileged import (
+    Alternatives,
+    PrivilegedVecEnv,
+    alternatives,
+    make_sb3_vec_env,
+    reference_estimator,
+)
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment

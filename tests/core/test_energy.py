@@ -88,7 +88,7 @@ def test_rollouts_begin_with_the_energy_of_each_sensor(monkeypatch: pytest.Monke
     def watched(signals: Any, runs: Any, normals: Any) -> Any:
         branch, noise = begin(signals, runs, normals)
         levels.append((branch.state.network.tokens, signals["energy"][:, runs]))
-        assert branch.state.network.harvest.shape == signals["energy"][:, runs].shape
+        assert branch.state.network.draws.harvest.shape == signals["energy"][:, runs].shape
         return branch, noise
 
     monkeypatch.setattr(policy._imagination, "begin", watched)

@@ -1,6 +1,7 @@
 """What the network says of arrivals and silence, and which noise its parts draw from."""
 
 import dataclasses
+import operator
 from typing import Any
 
 import numpy as np
@@ -55,12 +56,10 @@ def test_whose_turn_it_is_and_what_is_lost_have_noise_of_their_own() -> None:
     rng, steps = np.random.default_rng(0), np.zeros(50, dtype=np.int64)
     noise = rng.standard_normal((task.network.noise_channels, 50))
     before = task.network.advance(state, noise, steps)
-    for part, kept, changed in (
-        (slice(1), "lost", "admitted"),
-        (slice(1, None), "admitted", "lost"),
-    ):
+    lost, admitted = (operator.attrgetter(name) for name in ("draws.lost", "admitted"))
+    for part, kept, changed in ((slice(1), lost, admitted), (slice(1, None), admitted, lost)):
         other = noise.copy()
         other[part] = rng.standard_normal(other[part].shape)
         after = task.network.advance(state, other, steps)
-        np.testing.assert_array_equal(getattr(after, kept), getattr(before, kept))
-        assert (getattr(after, changed) != getattr(before, changed)).any()
+        np.testing.assert_array_equal(kept(after), kept(before))
+        assert (changed(after) != changed(before)).any()

@@ -82,7 +82,7 @@ class Log:
         """Move on."""
         state, now = self.batch.state, len(self.measured)
         self.measured.append(self.task.plant.measurement(state.plant))
-        lost, delay = state.network.lost, state.network.delay
+        lost, delay = state.network.draws.lost, state.network.draws.delay
         outcome = self.batch.step(request)
         sent = outcome.granted if lost is None else outcome.granted & ~lost
         self.arrival.append(np.where(sent, now + (0 if delay is None else delay), np.inf))
@@ -164,9 +164,9 @@ def test_a_lossy_network_leaves_the_plant_as_it_is() -> None:
     for _ in range(20):
         np.testing.assert_array_equal(lossy.state.plant.truth, plain.state.plant.truth)
         network = lossy.state.network
-        assert network.lost is not None
-        lost.append(network.lost)
-        delays.append(network.delay)
+        assert network.draws.lost is not None
+        lost.append(network.draws.lost)
+        delays.append(network.draws.delay)
         for batch in (lossy, plain):
             batch.step(np.ones((2, 400), dtype=np.bool_))
     together = np.corrcoef(lossy.normals()) - np.eye(lossy.channels)

@@ -45,9 +45,10 @@ class OtherLosses(Network):
     def draw(self, state: NetworkState, noise: Array) -> NetworkState:
         """Lose what arrives, and the reverse."""
         drawn = super().draw(state, noise)
-        assert drawn.lost is not None
-        unreported = True if drawn.unreported is None else drawn.unreported
-        return replace(drawn, lost=drawn.lost ^ unreported)
+        draws = drawn.draws
+        assert draws.lost is not None
+        unreported = True if draws.unreported is None else draws.unreported
+        return replace(drawn, draws=replace(draws, lost=draws.lost ^ unreported))
 
 
 def other(task: Task) -> Task:

@@ -103,7 +103,7 @@ def test_only_grants_cost_tokens_and_the_balance_closes(case: Case) -> None:
         rate, capacity = selection["token_rate"], selection["token_capacity"]
         for request in requests(batch.task, 3, STEPS):
             network, own = batch.state.network, selection["budget"] == "sensor"
-            before, gained = network.energy.copy(), network.harvest
+            before, gained = network.energy.copy(), network.draws.harvest
             outcome = batch.step(request)
             assert not (outcome.granted & ~request).any()
             np.testing.assert_allclose(outcome.cost, cost @ outcome.granted)

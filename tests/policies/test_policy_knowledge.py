@@ -234,7 +234,7 @@ LIARS: dict[str, tuple[Liar, str]] = {
     ),
     "is_shown_rows": (Liar("clock", lambda s: s["observation"].T[:2]), ANYTHING),
     "knows_the_truth": (Liar("scheduler", lambda s: dug_up(s, "plant.truth")), HIDDEN),
-    "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "network.lost")), HIDDEN),
+    "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "network.draws.lost")), HIDDEN),
 }
 
 

@@ -146,7 +146,7 @@ def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
         assert (apart < 1.0).all()
     if name == "remote":
         arrives = task.network.link_probability(state.network)[:, 0]
-        lost = state.network.lost.reshape(-1, 2, count).mean(-1)
+        lost = state.network.draws.lost.reshape(-1, 2, count).mean(-1)
         np.testing.assert_allclose(1.0 - lost, arrives[:, [0, count]], atol=0.03)
     if task.memory_estimator is not None:
         ours = imagined.memory.states["every"].measurement

@@ -26,7 +26,8 @@ class Addition:
     @property
     def count(self) -> str:
         """Its size as a heading says it."""
-        sizes = (("file", len(self.files)), ("line", len(self.lines)))
+        lines = sum(1 for *_, text in self.lines for line in text.splitlines() if line)
+        sizes = (("file", len(self.files)), ("line", lines))
         return ", ".join(f"{n} {word}{'s' * (n > 1)}" for word, n in sizes if n)
 
 
@@ -60,6 +61,19 @@ class DoubtfulFilter(KalmanFilter):
         kalman = super().outcomes(matrix, expectation, held, time)
         return kalman._replace(delivered_covariance=2.0 * kalman.delivered_covariance)
 '''
+ACTION = '''
+
+class Silence(Action):
+    """One bit per sensor; 0 is a request."""
+
+    meaning = "A 0 requests the sensor"
+    bits = False
+
+    def decode(self, choices: Choices) -> NDArray[Any]:
+        """See :class:`Action`."""
+        return np.equal(choices, 0)
+'''
+BUCKET = "core/token_bucket.py"
 RESULTS, METRICS = "evaluation/episodes.py", "evaluation/metrics.py"
 TOBIT, LINEAR = "systems/tobit/options.py", "systems/tobit/linear.py"
 ADDITIONS = {
@@ -118,6 +132,57 @@ ADDITIONS = {
             ),
         ),
     ),
+    "an option of all environments": Addition(
+        "plain, dear = (\n"
+        "    fusion_gym.make_task('fusion_gym/TobitOscillator-v1', surcharge=extra)\n"
+        "    for extra in (0.0, 2.0)\n"
+        ")\n"
+        "np.testing.assert_array_equal(dear.network.bucket.cost, plain.network.bucket.cost + 2.0)\n"
+        "env = gymnasium.make('fusion_gym/TobitOscillator-v1', surcharge=2.0)\n"
+        "assert 'surcharge: float = 2' in env.spec.pprint(disable_print=True)\n"
+        "assert 'surcharge' in dear.settings\n"
+        "assert dear.options.nominal().surcharge == 2.0",
+        lines=(
+            (
+                BUCKET,
+                "    token_cost: Annotated[ArrayLike, Scaling()] = 3.0",
+                "    surcharge: Annotated[float, Scaling()] = 0.0\n"
+                '    """Tokens that every transmission costs besides ``token_cost``."""',
+            ),
+            (
+                BUCKET,
+                '        """Tokens c (sensors, 1) of a transmission."""',
+                "        return self.options.surcharge + validation.positive("
+                "'token_cost', self.options.token_cost, (self.sensors,))[:, None]",
+            ),
+        ),
+    ),
+    "a rule of medium access": Addition(
+        "task = fusion_gym.make_task('fusion_gym/TobitOscillator-v1', access='countdown')\n"
+        "batch = EpisodeBatch.seeded(task, 2, 0)\n"
+        "everyone = np.ones((3, 2), dtype=bool)\n"
+        "turns = [batch.step(everyone).granted.argmax(0).tolist() for _ in range(3)]\n"
+        "assert turns == [[2, 2], [1, 1], [0, 0]]",
+        lines=(
+            (
+                "core/access.py",
+                "ACCESS: dict[str, AccessRow] = {",
+                '    "countdown": AccessRow("In turn.", lambda n, step, _: (2 - step) % n),',
+            ),
+        ),
+    ),
+    "an action": Addition(
+        "env = gymnasium.make('fusion_gym/TobitOscillator-v1', action='silence')\n"
+        "env.reset(seed=0)\n"
+        "assert env.step(np.array([1, 1, 0]))[-1]['granted'].tolist() == [False, False, True]\n"
+        "masks = env.unwrapped.action_masks()\n"
+        "assert masks.shape == (6,)\n"
+        "assert 'A 0 requests' in env.unwrapped.__doc__",
+        lines=(
+            ("core/action.py", "ACTIONS: dict[str, type[Action]] = {", '    "silence": Silence,'),
+            ("core/action.py", "        return super().choose(scores, threshold) & best", ACTION),
+        ),
+    ),
     "a filter": Addition(
         "task = fusion_gym.make_task('fusion_gym/TobitOscillator-v1', filter='doubtful')\n"
         "assert type(task.estimator.centre.filter).__name__ == 'DoubtfulFilter'\n"
@@ -153,6 +218,7 @@ ADDITIONS = {
 BEGIN = """
 import os, gymnasium, numpy as np, fusion_gym
 assert fusion_gym.__file__.startswith(os.getcwd())
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation import run_episodes, summarise
 oscillator = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", horizon=10)
 """

@@ -13,7 +13,7 @@ from fusion_gym import seeds
 # Each package may import from the rows above its own, and from itself.
 ROWS = (
     "arrays declaration docstrings entries errors gaussian importing linalg lowering namespace "
-    "option_file seeds validation version yaml_text",
+    "seeds validation version yaml_text",
     "fusion",
     "core",
     "systems",

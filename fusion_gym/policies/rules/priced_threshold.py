@@ -46,7 +46,7 @@ class PricedThreshold(BeliefRule):
     Args:
         own: every sensor decides locally, by its memory and the broadcasts.
         score: v and l. ``"value"``: the expected value of a packet and the squared norm of x* - x̂
-            (:mod:`fusion_gym.core.beliefs`). ``"innovation"``: the squared norm of the innovation,
+            (:mod:`fusion_gym.core.memory`). ``"innovation"``: the squared norm of the innovation,
             v in predicted standard deviations, l in the unit of the measurement. ``"variance"``:
             the reduction of the fused trace by a packet, and the trace without packets, both
             predicted by the centre.

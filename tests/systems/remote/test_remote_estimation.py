@@ -10,7 +10,7 @@ from parts import Parts
 from rules import make_rule
 
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.channel import Channel
+from fusion_gym.core.channel import Channel, ChannelOptions, InitialState
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.optimal import OptimalPolicy
@@ -32,7 +32,7 @@ LOSSY: dict[str, Any] = {
 
 
 def test_channel_follows_its_matrix_and_loses_by_its_state() -> None:
-    channel = Channel.gilbert_elliott(((0.7, 0.3), (0.1, 0.9)), (0.6, 0.2), sensors=2)
+    channel = Channel(ChannelOptions("gilbert_elliott", (0.6, 0.2), ((0.7, 0.3), (0.1, 0.9))), 2)
     draw, runs = np.random.default_rng(0), 50_000
     state = channel.start(draw.standard_normal((2, runs)))
     assert state.mean() == pytest.approx(0.75, abs=0.01)  # 0.3/(0.3 + 0.1) of good
@@ -50,13 +50,14 @@ def test_channel_follows_its_matrix_and_loses_by_its_state() -> None:
 def test_simple_channels_and_certain_starts() -> None:
     normals = np.random.default_rng(1).standard_normal((2, 20_000))
     nothing = np.zeros((2, 20_000), dtype=np.int64)
-    assert not Channel.perfect(2).lost(nothing, normals).any()
-    assert not Channel.perfect(2).loses
-    lost = Channel.independent((0.1, 1.0), 2).lost(nothing, normals)
+    assert not Channel(ChannelOptions(), 2).lost(nothing, normals).any()
+    assert not Channel(ChannelOptions(), 2).loses
+    lost = Channel(ChannelOptions("independent", (0.1, 1.0)), 2).lost(nothing, normals)
     assert lost[0].mean() == pytest.approx(0.1, abs=0.01)
     assert lost[1].all()
-    for number, name in enumerate(("bad", "good")):
-        channel = Channel.gilbert_elliott(((0.5, 0.5), (0.5, 0.5)), (0.1, 0.1), 2, name)
+    names: tuple[InitialState, ...] = "bad", "good"
+    for number, name in enumerate(names):
+        channel = Channel(ChannelOptions("gilbert_elliott", (0.1, 0.1), initial_channel=name), 2)
         assert (channel.start(normals) == number).all()
 
 
@@ -84,7 +85,11 @@ def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, An
     for step in range(60):
         signals, state = batch.signals(), batch.state
         truth, tokens = task.plant.truth(state.plant), batch.tokens.copy()
-        lost = np.zeros_like(ask[step]) if state.network.lost is None else state.network.lost
+        lost = (
+            np.zeros_like(ask[step])
+            if state.network.draws.lost is None
+            else state.network.draws.lost
+        )
         outcome = batch.step(ask[step])
         for run in range(runs):
             paid = 0.0
