@@ -38,7 +38,7 @@ def draw(axes: Any, options: dict[str, Any]) -> None:
         for sensor in np.flatnonzero(request):
             granted, arrived = outcome.granted[sensor, 0], outcome.arrived[sensor, 0]
             colour = "black" if granted else "0.7"
-            late = 0 if network.delay is None else int(network.delay[sensor, 0])
+            late = 0 if network.draws.delay is None else int(network.draws.delay[sensor, 0])
             marker = "x" if granted and not (arrived or late) else "o"
             face = colour if granted and marker == "o" else "none"
             style = {"ec": colour} if marker == "o" else {}

@@ -157,7 +157,7 @@ OPTIONS: list[tuple[Any, ...]] = [
     (REMOTE, {"access": "assignment"} | SILENT, "access = 'assignment'", "no silence"),
     (CORRELATED, {"action": "assignment"}, "action = 'assignment'", "access='any'"),
     (CORRELATED, QUALITIES | PAIRS | {"channels": 3, "channel": "independent"}, "shape (3, 3)"),
-    (CORRELATED, QUALITIES | {"channel": "independent"}, "shape (1, 3)"),
+    (CORRELATED, QUALITIES | {"channel": "independent"}, "shape (3,)"),
     (CORRELATED, QUALITIES | PAIRS | GILBERT_ELLIOTT, "a pair of probabilities"),
     (TOBIT, {"own_number": 1}, "own_number = 1 "),
 ]
