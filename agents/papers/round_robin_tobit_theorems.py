@@ -17,7 +17,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options, Plain
 from fusion_gym.policies.base import Policy
-from fusion_gym.systems.tobit.tobit_filter import expect_censored
+from fusion_gym.systems.tobit.filters import expect_censored
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them

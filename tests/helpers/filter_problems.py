@@ -6,8 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
-from fusion_gym.systems.tobit.filters import NodeFilter
+from fusion_gym.systems.tobit.filters import (
+    BoundConstants,
+    BoundTobitFilter,
+    EventError,
+    NodeFilter,
+)
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 Array = NDArray[np.float64]

@@ -11,9 +11,8 @@ from fusion_gym.core.task import Task
 from fusion_gym.errors import forbidden
 from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
-from fusion_gym.systems.tobit.centre import Centre, NodeCentre, SequentialCentre
-from fusion_gym.systems.tobit.filters import KalmanFilter
+from fusion_gym.systems.tobit.centres import Centre, NodeCentre, SequentialCentre
+from fusion_gym.systems.tobit.filters import BoundTobitFilter, KalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
 

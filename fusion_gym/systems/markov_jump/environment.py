@@ -20,10 +20,16 @@ from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralEstimator
-from fusion_gym.systems.markov_jump.centralised import CentralisedLinearFilter, InteractingModels
-from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
-from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
+from fusion_gym.systems.markov_jump.centralised import (
+    CentralisedLinearFilter,
+    InteractingModels,
+    MarkovJumpCentralEstimator,
+)
+from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    AugmentedModel,
+    LagRecursion,
+    LocalFilters,
+)
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 from fusion_gym.systems.markov_jump.system import FadingPlant, MarkovJumpEstimator
 from fusion_gym.systems.parts import numbered_states

@@ -29,9 +29,11 @@ from fusion_gym.core.knowledge import (
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.namespace import namespace, take
-from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
+    JointPrediction,
+    LagCovariances,
+    LagRecursion,
     LocalFilters,
     Times,
 )

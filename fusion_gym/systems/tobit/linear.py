@@ -18,7 +18,7 @@ from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 from fusion_gym.systems.silence import Trigger
-from fusion_gym.systems.tobit import options as tobit_options
+from fusion_gym.systems.tobit import system
 from fusion_gym.systems.tobit.centres import (
     HoldCentre,
     JointCentre,
@@ -27,8 +27,8 @@ from fusion_gym.systems.tobit.centres import (
     joint_centre,
     truncated_centre,
 )
+from fusion_gym.systems.tobit.filters import TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _JOINT = "joint_measurement_covariance"
 _HELD = "a centre that holds values cannot hold an estimate"
@@ -144,19 +144,17 @@ def _dimensions(value: Any) -> int:
 
 
 _FILTERS = {
-    "kalman": tobit_options.FILTERS["kalman"],
-    "tobit": tobit_options.at_the_nodes(TobitKalmanFilter),
-    "adf": tobit_options.FILTERS["adf"],
-    "stochastic": tobit_options.FILTERS["stochastic"],
-    "joint": tobit_options.Filter(
-        JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False
-    ),
-    "hold": tobit_options.Filter(
+    "kalman": system.FILTERS["kalman"],
+    "tobit": system.at_the_nodes(TobitKalmanFilter),
+    "adf": system.FILTERS["adf"],
+    "stochastic": system.FILTERS["stochastic"],
+    "joint": system.Filter(JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False),
+    "hold": system.Filter(
         HoldCentre,
         lambda options, sensors: hold_centre(sensors, _system(options)[0]),
         nodes=False,
     ),
-    "truncated": tobit_options.Filter(
+    "truncated": system.Filter(
         TruncatedCentre, truncated_centre, own=("trigger", "trigger_threshold"), nodes=False
     ),
 }
@@ -165,7 +163,7 @@ _FILTERS = {
 
 
 @dataclass(frozen=True)
-class LinearFusionOptions(tobit_options.FeedbackOptions):
+class LinearFusionOptions(system.FeedbackOptions):
     """Any linear plant x' = A x + w and any sensors y = C x + v, each of its own size.
 
     Every sensor has a Kalman filter; the centre fuses them and feeds the result back. If a sensor
@@ -200,7 +198,7 @@ class LinearFusionOptions(tobit_options.FeedbackOptions):
         (1, ('x1',))
     """
 
-    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
     """A of x(t+1) = A x(t) + w(t), (n, n)."""
     process_covariance: ArrayLike = ((_STEP**3 / 3.0, _STEP**2 / 2.0), (_STEP**2 / 2.0, _STEP))
@@ -271,7 +269,7 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     if correlated:
         _check_rules(choice)
     holds = choice.filter == "hold"
-    scenario = tobit_options.feedback_scenario(
+    scenario = system.feedback_scenario(
         choice,
         _FILTERS,
         plant,

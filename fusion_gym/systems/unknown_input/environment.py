@@ -24,9 +24,17 @@ from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.parts import numbered_states
-from fusion_gym.systems.unknown_input import filters, signals
+from fusion_gym.systems.unknown_input import filters
 from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
-from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
+from fusion_gym.systems.unknown_input.plant import (
+    ArrayInput,
+    InputSensors,
+    InputSignal,
+    MeanRevertingWalk,
+    Sinusoids,
+    Steps,
+    UnknownInputPlant,
+)
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 
 
@@ -320,23 +328,23 @@ def _with_example(options: UnknownInputOptions) -> Any:
     return replace(options, **missing)
 
 
-def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> signals.InputSignal:
+def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
     kind = options.input_signal
     shape = {name: getattr(options, name) for name in _SHAPE}
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
                 raise refusal(name, value, "None", "with an array as input_signal")
-        return signals.ArrayInput.create(inputs, kind, horizon)
+        return ArrayInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
     if kind == "sinusoids":
-        return signals.Sinusoids.create(inputs, amplitude, period, phase)
+        return Sinusoids.create(inputs, amplitude, period, phase)
     if not (isinstance(phase, str) and phase == "random"):
         reason = "phases belong to 'sinusoids'"
         raise forbidden("input_phase", phase, reason, f"with input_signal={kind!r}")
     if kind == "steps":
-        return signals.Steps.create(inputs, amplitude, period)
-    return signals.MeanRevertingWalk.create(inputs, amplitude, period)
+        return Steps.create(inputs, amplitude, period)
+    return MeanRevertingWalk.create(inputs, amplitude, period)
 
 
 def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:

@@ -19,8 +19,7 @@ from fusion_gym.namespace import namespace, ndtr
 from fusion_gym.systems.linear_plant import largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
-from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
-from fusion_gym.systems.unknown_input.signals import InputSignal
+from fusion_gym.systems.unknown_input.plant import InputSensors, InputSignal, UnknownInputPlant
 
 _IMAGINED = 32  # signals of which one is taken, where one is imagined
 

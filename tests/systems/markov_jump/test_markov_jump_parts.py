@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Dense, best_weights, random_model
 
 from fusion_gym.fusion.rules import MatrixWeightedFusion
-from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
-from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
+from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    AugmentedModel,
+    LagRecursion,
+    LocalFilters,
+)
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 
 Array = NDArray[np.float64]

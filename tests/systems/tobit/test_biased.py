@@ -14,9 +14,9 @@ from fusion_gym.core.access import first_requests
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.systems.tobit.filters import AssumedDensityFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator
-from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
 TRACKING = "fusion_gym/BiasedTracking-v1"

@@ -29,9 +29,8 @@ from scipy import stats
 import fusion_gym
 from fusion_gym import ConfigurationError
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.systems.tobit.bound_filter import BoundConstants, EventError
+from fusion_gym.systems.tobit.filters import BoundConstants, EventError, TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 OTHER_EPSILON = tuple(np.linspace(0.1, 1.4, 14).tolist())
 NEVER_CENSORED = -math.inf

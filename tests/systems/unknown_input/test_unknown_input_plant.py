@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from fusion_gym import linalg
-from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
-from fusion_gym.systems.unknown_input.signals import (
+from fusion_gym.systems.unknown_input.plant import (
     ArrayInput,
     InputSignal,
     MeanRevertingWalk,
     Sinusoids,
     Steps,
+    UnknownInputPlant,
 )
 
 Array = NDArray[np.float64]
