@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, StateT
-from fusion_gym.core.knowledge import Block
+from fusion_gym.core.knowledge import Block, log_deviation
 from fusion_gym.core.plant import Plant
 from fusion_gym.namespace import namespace
 
@@ -128,13 +128,13 @@ class ScaledEstimator(Estimator[StateT]):
         return estimate_block(meaning, mean, self.state_names, self.magnitude)
 
     def deviation_block(
-        self, name: str, meaning: str, value: Callable[[Any], Array], *nodes: tuple[str, ...]
+        self, name: str, whose: str, covariance: Callable[[Any], Array], *nodes: tuple[str, ...]
     ) -> Block:
         """Return a block of logarithms of deviations, of the centre or of ``nodes``."""
         return Block(
             name,
-            meaning,
-            value,
+            f"logarithm of {whose} over the open-loop deviation",
+            lambda state: log_deviation(covariance(state), self.reference),
             (*nodes, self.state_names),
             node="own" if nodes else "hidden",
             limit=RANGE,

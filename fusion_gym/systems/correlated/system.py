@@ -187,14 +187,12 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
             knowledge.age_block(nodes),
             self.deviation_block(
                 "local_log_deviation",
-                "logarithm of the node's predicted over the open-loop deviation",
-                lambda s: knowledge.log_deviation(s.prior_covariance[1:], self.reference),
+                "the node's predicted",
+                lambda s: s.prior_covariance[1:],
                 nodes,
             ),
             self.deviation_block(
-                "log_deviation",
-                "logarithm of the fused predicted over the open-loop deviation",
-                lambda s: knowledge.log_deviation(s.prior_covariance[0], self.reference),
+                "log_deviation", "the fused predicted", lambda s: s.prior_covariance[0]
             ),
             self.estimate_block(
                 "fused prediction over the state's root mean square", lambda s: s.prior_mean[0]

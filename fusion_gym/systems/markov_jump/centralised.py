@@ -458,10 +458,8 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
             ),
             self.deviation_block(
                 "log_deviation",
-                "logarithm of the predicted over the open-loop deviation",
-                lambda s: knowledge.log_deviation(
-                    knowledge.sensed(s.prediction).covariance[:n, :n], self.reference
-                ),
+                "the predicted",
+                lambda s: knowledge.sensed(s.prediction).covariance[:n, :n],
             ),
             self.estimate_block(
                 "prediction over the state's root mean square",

@@ -124,16 +124,8 @@ class MarkovJumpTrackingOptions(PaperOptions):
 def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
     """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
-    chain = options.mode_transition, options.initial_probabilities
-    start = options.initial_mean, options.initial_covariance
-    dynamics = MarkovJumpPlant.create(
-        options.transitions, options.process_gains, options.process_covariance, *chain, *start
-    )
-    fading = options.fading_values, options.fading_probabilities
-    noise = options.noise_coupling, options.measurement_variance
-    sensors = FadingSensors.create(
-        options.measurement_matrices, options.sampling_periods, *fading, *noise, dynamics
-    )
+    dynamics = MarkovJumpPlant.create(options)
+    sensors = FadingSensors.create(options, dynamics)
     weights = options.own_weights(dynamics.size)
     nature = Nature.create(options, (*dynamics.unmoved, "true_threshold_shift"))
     nature.check_growth(dynamics.true_radius, horizon)

@@ -233,16 +233,9 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
                 constants={"open-loop trace": self.reference.sum()},
             ),
             self.deviation_block(
-                "copy_log_deviation",
-                "logarithm of the copy's predicted over the open-loop deviation",
-                self._copy_log_deviation,
-                nodes,
+                "copy_log_deviation", "the copy's predicted", self._copy_covariance, nodes
             ),
-            self.deviation_block(
-                "log_deviation",
-                "logarithm of the silent fused over the open-loop deviation",
-                lambda s: log_deviation(s.prior_covariance, self.reference),
-            ),
+            self.deviation_block("log_deviation", "the silent fused", lambda s: s.prior_covariance),
             self.estimate_block(
                 "fused estimate without a transmission over the root mean square",
                 lambda s: s.prior_mean,
@@ -392,10 +385,9 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         trace = take(self.recursion.local_trace, self.filters.at(state.time))
         return log_deviation(trace[:, None, None], self.reference.sum(keepdims=True))[:, 0]
 
-    def _copy_log_deviation(self, state: MarkovJumpEstimate) -> Array:
+    def _copy_covariance(self, state: MarkovJumpEstimate) -> Array:
         prediction, nodes = sensed(state.prediction), np.arange(self.model.sensors.count)
-        covariance = prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
-        return log_deviation(covariance, self.reference)
+        return prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:
         """Return the predicted deviations (l, n, N) of node minus copy, above zero."""

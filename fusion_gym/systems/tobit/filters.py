@@ -16,8 +16,10 @@ is K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter update
 from __future__ import annotations
 
 import functools
+import itertools
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,16 +72,23 @@ class Outcomes(NamedTuple):
     silent_covariance: Array
 
 
-class NodeFilter(Protocol):
+@dataclass(frozen=True)
+class NodeFilter(ABC):
     """A local filter for sensors of one kind, all nodes at once."""
 
-    @property
-    def sensors(self) -> CensoredSensors:
-        """The sensors of the nodes."""
+    sensors: CensoredSensors
 
     def expect(self, mean: Array) -> Expectation:
-        """Return the predicted measurements from prior means (n, N) or (sensors, n, N)."""
+        """Return the predicted measurements from prior means (n, N) or (sensors, n, N).
 
+        With ζ = (τ - C x̂)/√R: q = 1 - Φ(ζ), λ = φ(ζ)/q, ŷ = q (C x̂ + λ √R) + (1 - q) τ.
+
+        Source: tobit_token_bucket, equations (5)-(7) and (23).
+        """
+        latent = linalg.matvec(self.sensors.measurement_matrix, mean)
+        return censored_moments(self.sensors, latent, self.sensors.deviation)
+
+    @abstractmethod
     def outcomes(
         self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
@@ -200,7 +209,7 @@ def _sequential_update(matrix: Array, value: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class KalmanFilter:
+class KalmanFilter(NodeFilter):
     r"""Kalman filter that ignores censoring; without a delivery the prior is the posterior.
 
     S = C P Cᵀ + R, K = P Cᵀ S⁻¹. It is biased where measurements are censored, and serves as the
@@ -224,8 +233,6 @@ class KalmanFilter:
     of Basic Engineering 82, 1960.
     """
 
-    sensors: CensoredSensors
-
     @property
     def silence(self) -> Array | None:
         """Weight Z (sensors, 1) of a silent sensor's information; ``None`` for none."""
@@ -235,15 +242,8 @@ class KalmanFilter:
         """See :class:`NodeFilter`."""
         latent = linalg.matvec(self.sensors.measurement_matrix, mean)
         xp = namespace(latent)
-        ones = xp.ones_like(latent)
-        return Expectation(
-            latent=latent,
-            value=latent,
-            noise_variance=self.sensors.variance * ones,
-            uncensored_probability=ones,
-            hazard=xp.zeros_like(latent),
-            truncated_variance=ones,
-        )
+        ones, zeros = xp.ones_like(latent), xp.zeros_like(latent)
+        return Expectation(latent, latent, self.sensors.variance * ones, ones, zeros, ones)
 
     def outcomes(
         self, matrix: Array, expectation: Expectation, held: Array, time: Array
@@ -330,17 +330,6 @@ class StochasticEventFilter(KalmanFilter):
         return plain._replace(silent_covariance=silent)
 
 
-def expect_censored(sensors: CensoredSensors, mean: Array) -> Expectation:
-    """Return the moments of a censored measurement from predicted states (sensors, n, N).
-
-    With ζ = (τ - C x̂)/√R: q = 1 - Φ(ζ), λ = φ(ζ)/q, ŷ = q (C x̂ + λ √R) + (1 - q) τ.
-
-    Source: tobit_token_bucket, equations (5)-(7) and (23).
-    """
-    latent = linalg.matvec(sensors.measurement_matrix, mean)
-    return censored_moments(sensors, latent, sensors.deviation)
-
-
 def censored_moments(sensors: CensoredSensors, latent: Array, deviation: Array) -> Expectation:
     """Return the moments of clip(z, τ, υ) for z ~ N(latent, deviation²), both (sensors, m, N).
 
@@ -354,14 +343,8 @@ def censored_moments(sensors: CensoredSensors, latent: Array, deviation: Array) 
     excess = namespace(q).where(sensors.uncensored, 0.0, moments.excess)
     variance = q * moments.truncated_variance + q * (1.0 - q) * excess * excess
     value = q * (latent + deviation * moments.hazard) + (1.0 - q) * sensors.finite_threshold
-    return Expectation(
-        latent=latent,
-        value=value,
-        noise_variance=deviation * deviation * variance,
-        uncensored_probability=q,
-        hazard=moments.hazard,
-        truncated_variance=moments.truncated_variance,
-    )
+    noise, own = deviation * deviation * variance, moments.truncated_variance
+    return Expectation(latent, value, noise, q, moments.hazard, own)
 
 
 def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array) -> Expectation:
@@ -384,21 +367,17 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
         + inside * above * to_high**2
         + below * above * (to_low + to_high) ** 2
     )
-    return Expectation(
-        latent=latent,
-        value=below * sensors.finite_threshold + above * sensors.finite_upper + inside * centre,
-        noise_variance=inside * deviation**2 * moments.variance + between,
-        uncensored_probability=inside,
-        hazard=moments.mean,
-        truncated_variance=xp.clip(moments.variance, 1e-12, 1.0),
-    )
+    value = below * sensors.finite_threshold + above * sensors.finite_upper + inside * centre
+    noise = inside * deviation**2 * moments.variance + between
+    own = xp.clip(moments.variance, 1e-12, 1.0)
+    return Expectation(latent, value, noise, inside, moments.mean, own)
 
 
 @dataclass(frozen=True)
 class TobitKalmanFilter(KalmanFilter):
     r"""Tobit Kalman filter; without a delivery the prior is the posterior.
 
-    S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :func:`expect_censored`.
+    S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :meth:`NodeFilter.expect`.
 
     Equation:
         $$
@@ -428,9 +407,7 @@ class TobitKalmanFilter(KalmanFilter):
     tobit_token_bucket, equations (21)-(23) with κ₁ = 1 and S = diag(R v).
     """
 
-    def expect(self, mean: Array) -> Expectation:
-        """See :class:`NodeFilter`."""
-        return expect_censored(self.sensors, mean)
+    expect = NodeFilter.expect
 
 
 @dataclass(frozen=True)
@@ -484,10 +461,24 @@ class AssumedDensityFilter:
         self, mean: Array, root: Array, measurement: Array, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
         """Return mean (n, N) and root (n, n, N) after the granted (sensors, N) measurements."""
-        for sensor in active_rows(granted).tolist():
-            for component in range(self.sensors.size):
-                value, taken = measurement[sensor, component], granted[sensor]
-                mean, root = self._take(mean, root, sensor, component, value, taken)
+        sensors, xp = self.sensors, namespace(mean, root)
+        active = active_rows(granted).tolist()
+        for sensor, component in itertools.product(active, range(sensors.size)):
+            place = sensor, component
+            row, value = sensors.measurement_matrix[place], measurement[place]
+            scalar = Scalar.from_row(root, row, sensors.variance[place])
+            latent, deviation = linalg.dot(row, mean), xp.sqrt(scalar.variance)
+            step = (value - latent) / scalar.variance
+            loss = xp.ones_like(step)
+            for sign, threshold in ((1.0, sensors.threshold), (-1.0, sensors.upper)):
+                limit = threshold[place]
+                if np.isfinite(limit).all():
+                    censored = value <= limit if sign > 0 else value >= limit
+                    distance = sign * (latent - limit) / deviation
+                    step = xp.where(censored, -sign * gaussian.hazard(distance) / deviation, step)
+                    loss = xp.where(censored, 1.0 - gaussian.truncated_variance(distance), loss)
+            mean = mean + scalar.cross * xp.where(granted[sensor], step, 0.0)
+            root = scalar.posterior(xp.where(granted[sensor], loss, 0.0))
         return mean, root
 
     def expected_covariance(self, mean: Array, root: Array) -> Array:
@@ -510,38 +501,6 @@ class AssumedDensityFilter:
                 share -= gaussian.upper_tail(distance) * gaussian.truncated_variance(distance)
             root = scalar.posterior(share)
         return linalg.gram(root)
-
-    def _take(
-        self,
-        mean: Array,
-        root: Array,
-        sensor: int,
-        component: int,
-        value: Array,
-        granted: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
-        row = self.sensors.measurement_matrix[sensor, component]
-        scalar = Scalar.from_row(root, row, self.sensors.variance[sensor, component])
-        xp = namespace(mean, root)
-        latent, deviation = linalg.dot(row, mean), xp.sqrt(scalar.variance)
-        step = (value - latent) / scalar.variance
-        loss = xp.ones_like(step)
-        for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
-            limit = threshold[sensor, component]
-            if not np.isfinite(limit).all():
-                continue
-            censored = value <= limit if sign > 0 else value >= limit
-            distance = sign * (latent - limit) / deviation
-            step = xp.where(censored, -sign * gaussian.hazard(distance) / deviation, step)
-            loss = xp.where(censored, _loss(distance), loss)
-        step = xp.where(granted, step, 0.0)
-        loss = xp.where(granted, loss, 0.0)
-        return mean + scalar.cross * step, scalar.posterior(loss)
-
-
-def _loss(distance: Array) -> Array:
-    """Return h (h - t) = 1 - variance of a standard normal beyond t."""
-    return 1.0 - gaussian.truncated_variance(distance)
 
 
 @dataclass(frozen=True)
@@ -643,7 +602,7 @@ class EventError:
 
 
 @dataclass(frozen=True)
-class BoundTobitFilter:
+class BoundTobitFilter(NodeFilter):
     r"""Tobit Kalman filter whose gain minimises the trace of the paper's bound.
 
     ``event_error`` (or None) is the κ₆ Ξ term of a delivery; ``hold`` says what happens without
@@ -683,7 +642,6 @@ class BoundTobitFilter:
     Source: tobit_token_bucket, equations (20)-(37), Theorems 1 and 2.
     """
 
-    sensors: CensoredSensors
     constants: BoundConstants
     event_error: EventError | None
     hold: bool
@@ -697,10 +655,6 @@ class BoundTobitFilter:
                 f"filter='paper', silent='hold': each must have its {self.sensors.size} rows "
                 "independent, because the held update (37) has no noise term"
             )
-
-    def expect(self, mean: Array) -> Expectation:
-        """See :class:`NodeFilter`."""
-        return expect_censored(self.sensors, mean)
 
     def outcomes(
         self, matrix: Array, expectation: Expectation, held: Array, time: Array

@@ -39,110 +39,6 @@ _STEP = 0.1  # seconds between two samples of the default target
 _REFERENCE_HORIZON = 10
 
 
-def linear_sensors(
-    states: int, matrices: Any, covariances: Any, joint: Any, threshold: Any, upper: Any
-) -> CensoredSensors:
-    """Return sensors with the channels of the largest; the last channels of the others are absent.
-
-    A sensor whose own covariance R is not diagonal reports F⁻¹ y with F Fᵀ = R.
-
-    Args:
-        states: number of states n.
-        matrices: C of each sensor, (channels, n) or one row (n,).
-        covariances: R of each sensor, for independent sensors.
-        joint: covariance of all channels of all sensors, or None.
-        threshold: lower limits: one number, one per sensor, or a list for each sensor.
-        upper: upper limits, in the same form.
-
-    Raises:
-        ConfigurationError: a value that is not allowed, or censoring of correlated sensors.
-    """
-    rows = _matrices(matrices, states)
-    sizes = [len(row) for row in rows]
-    shape = (len(sizes), max(sizes))
-    low = _limits("censoring_threshold", threshold, sizes, -np.inf)
-    high = _limits("censoring_upper", upper, sizes, np.inf)
-    present = np.arange(shape[1]) < np.array(sizes)[:, None]
-    whole = None
-    if joint is None:
-        own = _covariances(covariances, sizes)
-    else:
-        whole = validation.covariance(_JOINT, joint, sum(sizes), definite=True)
-        ends = np.cumsum(sizes)
-        own = [whole[end - n : end, end - n : end] for n, end in zip(sizes, ends, strict=True)]
-    limited = [bool(np.isfinite(ends).any()) for ends in np.concatenate([low, high], axis=1)]
-    matrix, variance, factors = np.zeros((*shape, states)), np.ones(shape), []
-    for place, (size, covariance) in enumerate(zip(sizes, own, strict=True)):
-        factor: Array = np.eye(size)
-        variances = np.diagonal(covariance)
-        if np.count_nonzero(covariance - np.diag(variances)):
-            if limited[place]:
-                name = f"measurement_covariances[{place}]" if whole is None else _JOINT
-                allowed = f"diagonal for the censored sensor {place}"
-                raise validation.refusal(name, covariance, allowed)
-            factor, variances = linalg.cholesky(covariance[..., None])[..., 0], np.ones(size)
-        matrix[place, :size] = np.linalg.solve(factor, rows[place])
-        variance[place, :size] = variances
-        factors.append(factor)
-    sensors = CensoredSensors.create(matrix, variance, low, states, high, present)
-    if whole is None or not np.count_nonzero(whole - block_diag(*own)):
-        return sensors
-    if any(limited):
-        allowed = "without correlations between sensors, because some are censored"
-        raise validation.refusal(_JOINT, joint, allowed)
-    scale = block_diag(*factors) * np.sqrt(variance[present])
-    factor, places = np.eye(present.size), np.flatnonzero(present)
-    factor[np.ix_(places, places)] = np.linalg.solve(scale, np.linalg.cholesky(whole))
-    return replace(sensors, noise_correlation=factor[..., None])
-
-
-def _matrices(value: Any, states: int) -> list[Array]:
-    result = []
-    for place, item in enumerate(validation.entries("measurement_matrices", value, "a matrix")):
-        name = f"measurement_matrices[{place}]"
-        row = _dimensions(item) == 1
-        matrix = validation.array(name, item, (states,) if row else (None, states))
-        result.append(matrix[None] if row else matrix)
-    return result
-
-
-def _each(name: str, value: Any, kind: str, sensors: int) -> list[tuple[str, Any]]:
-    """Return field and value of each sensor, from one number for all or one entry for each."""
-    if _dimensions(value) == 0:
-        return [(name, value)] * sensors
-    entries = validation.entries(name, value, kind, count=sensors)
-    return [(f"{name}[{place}]", entry) for place, entry in enumerate(entries)]
-
-
-def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
-    each = _each("measurement_covariances", values, "a covariance or a variance", len(sizes))
-    result = []
-    for size, (full, value) in zip(sizes, each, strict=True):
-        if _dimensions(value) == 0:
-            value = validation.number(full, value, at_least=validation.SMALLEST**2) * np.eye(size)
-        result.append(validation.covariance(full, value, size, definite=True))
-    return result
-
-
-def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
-    """Return limits (sensors, m); absent channels have the limit ``none``."""
-    each = _each(name, values, "a number or a list", len(sizes))
-    result = np.full((len(sizes), max(sizes)), none)
-    for place, (size, (full, value)) in enumerate(zip(sizes, each, strict=True)):
-        result[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
-    return result
-
-
-def _dimensions(value: Any) -> int:
-    """Return the depth of a nested value, by its first entries."""
-    if isinstance(value, np.ndarray):
-        return value.ndim
-    depth = 0
-    while isinstance(value, (list, tuple)):
-        depth, value = depth + 1, value[0] if value else 0.0
-    return depth + (value.ndim if isinstance(value, np.ndarray) else 0)
-
-
 _FILTERS = {
     "kalman": system.FILTERS["kalman"],
     "tobit": system.at_the_nodes(TobitKalmanFilter),
@@ -293,32 +189,115 @@ def _system(options: LinearFusionOptions) -> Sequence[Any]:
 
 
 def _parts(options: LinearFusionOptions, _: object) -> tuple[LinearPlant, CensoredSensors]:
-    plant = _plant(options)
-    return plant, _sensors(options, plant.size)
-
-
-def _plant(options: LinearFusionOptions) -> LinearPlant:
     transition = validation.array("transition", options.transition, (None, None))
     size = len(transition)
     mean = np.zeros(size) if options.initial_mean is None else options.initial_mean
     start = np.eye(size) if options.initial_covariance is None else options.initial_covariance
-    return LinearPlant.create(transition, options.process_covariance, mean, start)
+    plant = LinearPlant.create(transition, options.process_covariance, mean, start)
+    return plant, _sensors(options, size)
 
 
 def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
-    joint, own = options.joint_measurement_covariance, options.measurement_covariances
+    """Return sensors with the channels of the largest; the last channels of the others are absent.
+
+    A sensor whose own covariance R is not diagonal reports F⁻¹ y with F Fᵀ = R.
+
+    Args:
+        options: options of the environment.
+        states: number of states n.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, or censoring of correlated sensors.
+    """
+    joint, covariances = options.joint_measurement_covariance, options.measurement_covariances
     default = LinearFusionOptions.measurement_covariances
-    if joint is not None and plain_options(own) != default:
+    if joint is not None and plain_options(covariances) != default:
         allowed = "left out with joint_measurement_covariance"
-        raise validation.refusal("measurement_covariances", own, allowed)
-    return linear_sensors(
-        states,
-        options.measurement_matrices,
-        own,
-        joint,
-        options.censoring_threshold,
-        options.censoring_upper,
-    )
+        raise validation.refusal("measurement_covariances", covariances, allowed)
+    rows = _matrices(options.measurement_matrices, states)
+    sizes = [len(row) for row in rows]
+    shape = (len(sizes), max(sizes))
+    low = _limits("censoring_threshold", options.censoring_threshold, sizes, -np.inf)
+    high = _limits("censoring_upper", options.censoring_upper, sizes, np.inf)
+    present = np.arange(shape[1]) < np.array(sizes)[:, None]
+    whole = None
+    if joint is None:
+        own = _covariances(covariances, sizes)
+    else:
+        whole = validation.covariance(_JOINT, joint, sum(sizes), definite=True)
+        ends = np.cumsum(sizes)
+        own = [whole[end - n : end, end - n : end] for n, end in zip(sizes, ends, strict=True)]
+    limited = [bool(np.isfinite(ends).any()) for ends in np.concatenate([low, high], axis=1)]
+    matrix, variance, factors = np.zeros((*shape, states)), np.ones(shape), []
+    for place, (size, covariance) in enumerate(zip(sizes, own, strict=True)):
+        factor: Array = np.eye(size)
+        variances = np.diagonal(covariance)
+        if np.count_nonzero(covariance - np.diag(variances)):
+            if limited[place]:
+                name = f"measurement_covariances[{place}]" if whole is None else _JOINT
+                allowed = f"diagonal for the censored sensor {place}"
+                raise validation.refusal(name, covariance, allowed)
+            factor, variances = linalg.cholesky(covariance[..., None])[..., 0], np.ones(size)
+        matrix[place, :size] = np.linalg.solve(factor, rows[place])
+        variance[place, :size] = variances
+        factors.append(factor)
+    sensors = CensoredSensors.create(matrix, variance, low, states, high, present)
+    if whole is None or not np.count_nonzero(whole - block_diag(*own)):
+        return sensors
+    if any(limited):
+        allowed = "without correlations between sensors, because some are censored"
+        raise validation.refusal(_JOINT, joint, allowed)
+    scale = block_diag(*factors) * np.sqrt(variance[present])
+    factor, places = np.eye(present.size), np.flatnonzero(present)
+    factor[np.ix_(places, places)] = np.linalg.solve(scale, np.linalg.cholesky(whole))
+    return replace(sensors, noise_correlation=factor[..., None])
+
+
+def _matrices(value: Any, states: int) -> list[Array]:
+    result = []
+    for place, item in enumerate(validation.entries("measurement_matrices", value, "a matrix")):
+        name = f"measurement_matrices[{place}]"
+        row = _dimensions(item) == 1
+        matrix = validation.array(name, item, (states,) if row else (None, states))
+        result.append(matrix[None] if row else matrix)
+    return result
+
+
+def _each(name: str, value: Any, kind: str, sensors: int) -> list[tuple[str, Any]]:
+    """Return field and value of each sensor, from one number for all or one entry for each."""
+    if _dimensions(value) == 0:
+        return [(name, value)] * sensors
+    entries = validation.entries(name, value, kind, count=sensors)
+    return [(f"{name}[{place}]", entry) for place, entry in enumerate(entries)]
+
+
+def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
+    each = _each("measurement_covariances", values, "a covariance or a variance", len(sizes))
+    result = []
+    for size, (full, value) in zip(sizes, each, strict=True):
+        if _dimensions(value) == 0:
+            value = validation.number(full, value, at_least=validation.SMALLEST**2) * np.eye(size)
+        result.append(validation.covariance(full, value, size, definite=True))
+    return result
+
+
+def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
+    """Return limits (sensors, m); absent channels have the limit ``none``."""
+    each = _each(name, values, "a number or a list", len(sizes))
+    result = np.full((len(sizes), max(sizes)), none)
+    for place, (size, (full, value)) in enumerate(zip(sizes, each, strict=True)):
+        result[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
+    return result
+
+
+def _dimensions(value: Any) -> int:
+    """Return the depth of a nested value, by its first entries."""
+    if isinstance(value, np.ndarray):
+        return value.ndim
+    depth = 0
+    while isinstance(value, (list, tuple)):
+        depth, value = depth + 1, value[0] if value else 0.0
+    return depth + (value.ndim if isinstance(value, np.ndarray) else 0)
 
 
 def _names(value: Any, states: int) -> tuple[str, ...]:

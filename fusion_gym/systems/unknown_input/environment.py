@@ -234,13 +234,9 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
     """Return the scenario of these options."""
     options = _with_example(choice)
     horizon = validation.horizon(options.horizon)
-    motion = options.transition, options.input_matrix, options.process_covariance
-    start = options.initial_mean, options.initial_covariance, options.initial_half_width
-    plant = UnknownInputPlant.create(*motion, options.sampling_period, *start)
+    plant = UnknownInputPlant.create(options)
     signal = _signal(options, plant.inputs, horizon)
-    sensors = InputSensors.create(
-        options.measurement_matrices, options.measurement_covariance, plant
-    )
+    sensors = InputSensors.create(options, plant)
     trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
     if np.any(open_loop[plant.size :] <= 0.0):
@@ -350,9 +346,7 @@ def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSig
 def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:
     kind = validation.choice("filter", options.filter, FILTERS)
     factor = validation.positive("young_factor", options.young_factor, (sensors.count,))
-    model = filters.InputModel.create(
-        plant, options.input_memory, options.input_change, options.input_deviation
-    )
+    model = filters.InputModel.create(plant, options)
     joint = filters.JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
     weights = options.own_weights(plant.size + plant.inputs)

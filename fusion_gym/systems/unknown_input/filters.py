@@ -12,6 +12,7 @@ discrete-time systems", Automatica 43, 2007.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -99,27 +100,24 @@ class InputModel:
     initial_covariance: Array
 
     @classmethod
-    def create(
-        cls, plant: UnknownInputPlant, memory: ArrayLike, change: ArrayLike, deviation: ArrayLike
-    ) -> InputModel:
+    def create(cls, plant: UnknownInputPlant, options: Any) -> InputModel:
         """Return the model of a plant's input.
 
         Args:
             plant: the plant.
-            memory: r in [0, 1]: one number, or one per input.
-            change: deviation of η > 0: one number, or one per input.
-            deviation: deviation > 0 of an input without a measurement: one number, or one per
+            options: ``input_memory`` r in [0, 1], ``input_change``, the deviation of η > 0, and
+                ``input_deviation`` > 0 of an input without a measurement: one number, or one per
                 input.
 
         Raises:
             ConfigurationError: a number outside these limits.
         """
         n, q = plant.size, plant.inputs
-        retention = validation.not_negative("input_memory", memory, (q,))
+        retention = validation.not_negative("input_memory", options.input_memory, (q,))
         if np.any(retention > 1.0):
-            raise validation.refusal("input_memory", memory, ">= 0 and <= 1")
-        steps = validation.positive("input_change", change, (q,))
-        first = validation.positive("input_deviation", deviation, (q,))
+            raise validation.refusal("input_memory", options.input_memory, ">= 0 and <= 1")
+        steps = validation.positive("input_change", options.input_change, (q,))
+        first = validation.positive("input_deviation", options.input_deviation, (q,))
         b = plant.input_matrix[..., 0]
         spread = np.concatenate((b, np.eye(q))) * steps
         noise = spread @ spread.T

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -298,40 +298,28 @@ class UnknownInputPlant(LinearDynamics):
     initial_half_width: Array | None = None
 
     @classmethod
-    def create(
-        cls,
-        transition: ArrayLike,
-        input_matrix: ArrayLike,
-        process_covariance: ArrayLike,
-        sampling_period: int,
-        initial_mean: ArrayLike,
-        initial_covariance: ArrayLike,
-        initial_half_width: ArrayLike | None = None,
-    ) -> UnknownInputPlant:
-        """Return the plant of the matrices of a small step, without a batch axis.
+    def create(cls, options: Any) -> UnknownInputPlant:
+        """Return the plant of an environment's options.
 
         Args:
-            transition: A (n, n).
-            input_matrix: B (n, q), q <= n.
-            process_covariance: W (n, n).
-            sampling_period: a, from 1 to 1000.
-            initial_mean: (n,).
-            initial_covariance: (n, n).
-            initial_half_width: (n,), or None.
+            options: matrices of a small step without a batch axis: ``transition`` A (n, n),
+                ``input_matrix`` B (n, q), q <= n, ``process_covariance`` W (n, n),
+                ``sampling_period`` a from 1 to 1000, ``initial_mean`` (n,), ``initial_covariance``
+                (n, n), ``initial_half_width`` (n,) or None.
 
         Raises:
             ConfigurationError: a wrong shape, an entry that is not finite, a number outside these
                 limits, or a covariance that is not positive semi-definite.
         """
-        small = validation.square("transition", transition)
-        n = len(small)
-        inputs = validation.array("input_matrix", input_matrix, (n, None))
-        process = validation.covariance("process_covariance", process_covariance, n)
-        law, half = initial_law(initial_mean, initial_covariance, n), None
-        if initial_half_width is not None:
-            half = validation.not_negative("initial_half_width", initial_half_width, (n,))[:, None]
+        small = validation.square("transition", options.transition)
+        n, half = len(small), options.initial_half_width
+        inputs = validation.array("input_matrix", options.input_matrix, (n, None))
+        process = validation.covariance("process_covariance", options.process_covariance, n)
+        law = initial_law(options.initial_mean, options.initial_covariance, n)
+        if half is not None:
+            half = validation.not_negative("initial_half_width", half, (n,))[:, None]
         steps = validation.integer(
-            "sampling_period", sampling_period, at_least=1, at_most=_LONGEST_PERIOD
+            "sampling_period", options.sampling_period, at_least=1, at_most=_LONGEST_PERIOD
         )
         lifted, lifted_inputs, lifted_process = np.eye(n), np.zeros_like(inputs), np.zeros((n, n))
         for _ in range(steps):
@@ -434,22 +422,22 @@ class InputSensors(Sensors):
     complement: Array
 
     @classmethod
-    def create(
-        cls, matrices: ArrayLike, covariances: ArrayLike, plant: UnknownInputPlant
-    ) -> InputSensors:
-        """Return sensors from arrays without a batch axis.
+    def create(cls, options: Any, plant: UnknownInputPlant) -> InputSensors:
+        """Return the sensors of an environment's options.
 
         Args:
-            matrices: C (l, m, n).
-            covariances: V: one number, one per sensor, variances (l, m), or matrices (l, m, m).
+            options: arrays without a batch axis: ``measurement_matrices`` C (l, m, n) and
+                ``measurement_covariance`` V: one number, one per sensor, variances (l, m), or
+                matrices (l, m, m).
             plant: the plant.
 
         Raises:
             ConfigurationError: a wrong shape, a V_i that is not positive definite, or a sensor that
                 cannot observe the input: rank(C_i ℬ) below the number of inputs.
         """
-        c = validation.array("measurement_matrices", matrices, (None, None, plant.size))
-        noise = _noise_covariances(covariances, *c.shape[:2])
+        shape = None, None, plant.size
+        c = validation.array("measurement_matrices", options.measurement_matrices, shape)
+        noise = _noise_covariances(options.measurement_covariance, *c.shape[:2])
         inverses, complements = [], []
         for sensor, matrix in enumerate(c):
             inverse, complement = _observable_input(sensor, matrix, plant)
