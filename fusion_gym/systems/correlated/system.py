@@ -29,6 +29,7 @@ from fusion_gym.systems.correlated.filters import (
 )
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
+from fusion_gym.systems.solvable import BoundingEstimator
 from fusion_gym.validation import refusal
 
 _ALL = slice(None)
@@ -138,7 +139,9 @@ SIGNALS = (
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
+class CorrelatedTrackingEstimator(
+    ScaledEstimator[CorrelatedTrackingEstimate], BoundingEstimator[CorrelatedTrackingEstimate]
+):
     """Robust local filters, and a fusion rule without feedback.
 
     ``joint`` tracks the covariances of the errors, of which the actual ones are the share

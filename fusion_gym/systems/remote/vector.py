@@ -18,6 +18,7 @@ from fusion_gym.core.nature import Nature, true_motion, true_noise
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.parts import RANGE, Deliveries, NormalPlant, Truth, numbered_states
+from fusion_gym.systems.solvable import AgedSources
 
 KEYS = ("transition", "process_covariance", "measurement_matrix", "measurement_covariance")
 _FLOOR = 1e-12  # of a deviation, in process deviations: zero could not divide
@@ -103,7 +104,7 @@ def _padded(blocks: Sequence[NDArray[Any]]) -> Array:
 
 
 @dataclass(frozen=True)
-class VectorSources(NormalPlant):
+class VectorSources(NormalPlant, AgedSources[Truth]):
     """l independent sources with s states and m channels at most; x(0) ~ N(0, P̄).
 
     Shapes: ``transition`` (l, s, s, 1), ``process_factor`` (l, s, s, 1), ``measurement_matrix``
@@ -213,6 +214,19 @@ class VectorSources(NormalPlant):
         moved = linalg.matmul(self.transition, covariance)
         moved = linalg.matmul(moved, linalg.transpose(self.transition))
         return moved + linalg.gram(self.process_factor)
+
+    def age_costs(self, weights: Array, ages: int) -> Array:
+        """Return the weighted traces (ages, l) of the sources' covariances at the ages 0, 1, …."""
+        own, covariance, costs = self.blocks(weights)[..., 0], self.posterior, []
+        for _ in range(ages):
+            costs.append((own * linalg.diagonal(covariance)[..., 0]).sum(1))
+            covariance = self.predict_covariance(covariance)
+        return np.array(costs)
+
+    @property
+    def radii(self) -> Array:
+        """Spectral radius (l,) of each source."""
+        return np.array([np.abs(np.linalg.eigvals(a)).max() for a in self.transition[..., 0]])
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without a delivery."""

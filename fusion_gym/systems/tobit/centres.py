@@ -59,12 +59,14 @@ class Centre(Protocol):
         separable: Whether :meth:`single` is available, and faster than one update after another.
         reads_silence: Whether a step without a delivery is information.
         traceable: Whether JAX traces the methods.
+        predicts: Whether a step without a delivery only predicts, by A x̂.
     """
 
     filter: Any
     separable: ClassVar[bool] = False
     reads_silence: ClassVar[bool] = False
     traceable: ClassVar[bool] = True
+    predicts: ClassVar[bool] = False
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -166,6 +168,11 @@ class NodeCentre(Centre):
 
     filter: NodeFilter
     share: Array
+
+    @property
+    def predicts(self) -> bool:  # type: ignore[override]
+        """See :class:`Centre`."""
+        return self.filter.predicts
 
     @property
     def predictable(self) -> bool:
@@ -331,6 +338,7 @@ class SequentialCentre(Centre):
     """A centre without nodes, which processes the deliveries one after another."""
 
     filter: AssumedDensityFilter
+    predicts = True
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` have no effect."""

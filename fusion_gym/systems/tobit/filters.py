@@ -19,7 +19,7 @@ import functools
 import itertools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,8 +74,12 @@ class Outcomes(NamedTuple):
 
 @dataclass(frozen=True)
 class NodeFilter(ABC):
-    """A local filter for sensors of one kind, all nodes at once."""
+    """A local filter for sensors of one kind, all nodes at once.
 
+    ``predicts`` says whether the estimate only moves by the plant's matrix without a delivery.
+    """
+
+    predicts: ClassVar[bool] = False
     sensors: CensoredSensors
 
     def expect(self, mean: Array) -> Expectation:
@@ -233,6 +237,8 @@ class KalmanFilter(NodeFilter):
     of Basic Engineering 82, 1960.
     """
 
+    predicts = True
+
     @property
     def silence(self) -> Array | None:
         """Weight Z (sensors, 1) of a silent sensor's information; ``None`` for none."""
@@ -295,6 +301,7 @@ class StochasticEventFilter(KalmanFilter):
     60(10), 2015, the estimator of the closed-loop schedule.
     """
 
+    predicts = False
     weight: Array
 
     @classmethod
@@ -645,6 +652,11 @@ class BoundTobitFilter(NodeFilter):
     constants: BoundConstants
     event_error: EventError | None
     hold: bool
+
+    @property
+    def predicts(self) -> bool:  # type: ignore[override]
+        """See :class:`NodeFilter`; not if it holds."""
+        return not self.hold
 
     def __post_init__(self) -> None:
         matrices = self.sensors.measurement_matrix[..., 0]

@@ -21,8 +21,9 @@ from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import Block, Signal, age_block, common_signals, numbered, sensed
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.core.plant import Plant
 from fusion_gym.declaration import plain_options
-from fusion_gym.errors import forbidden, refusal
+from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.namespace import namespace
 from fusion_gym.systems import parts
@@ -32,6 +33,7 @@ from fusion_gym.systems.linear_plant import (
     typical_magnitude,
     variance_loss,
 )
+from fusion_gym.systems.solvable import LinearEstimator, LinearProblem
 from fusion_gym.systems.tobit.centres import (
     Centre,
     CentrePrediction,
@@ -200,7 +202,9 @@ _SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a re
 
 
 @dataclass(frozen=True)
-class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
+class CensoredEstimator(
+    parts.AdoptingEstimator[CensoredEstimate], LinearEstimator[CensoredEstimate]
+):
     """A centre with or without nodes.
 
     ``model`` is the plant that the filters assume. ``scale`` (n,) divides observed state estimates
@@ -247,6 +251,27 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
     def state_weights(self) -> Array:
         """Weights (n,) of the traces among the signals: all 1, a plain trace as in the papers."""
         return np.ones(self.model.size)
+
+    def linear_problem(self, plant: Plant[Any], where: str) -> LinearProblem | None:
+        """See :class:`LinearEstimator`."""
+        if type(plant) is not CensoredPlant:
+            return None
+        dynamics, sensors = plant.dynamics, plant.sensors
+        if self.model is not dynamics:
+            reason = "the filters must predict with the plant's own matrix"
+            raise forbidden("bias_aware", False, reason, where)
+        plant.nature.refuse(where)
+        for part in (dynamics, sensors):
+            part.refuse_schedule(where)
+        if not self.centre.predicts:
+            raise ConfigurationError(
+                f"filter is not allowed {where}: in silence the centre must predict, so neither "
+                "hold the last value (filter='paper' with silent='hold') nor use the information "
+                "of silence (filter='stochastic')"
+            )
+        motion = dynamics.transition, dynamics.process_covariance, dynamics.initial_covariance
+        both = sensors.stacked_matrix, sensors.noise_covariance
+        return LinearProblem(*(array[..., 0] for array in (*motion, *both)))
 
     def with_model(
         self,
@@ -571,7 +596,7 @@ def feedback_scenario(
         changed: dict[str, Any] = dict.fromkeys(() if row.nodes else _OF_FUSION)
         changed["filter"] = memory_filter
         memory = replace(estimator, centre=row.make(replace(options, **changed), sensors))
-    defaults = dict(policy_defaults or {})
+    defaults: dict[str, Any] = dict(policy_defaults or {})
     if options.stochastic_weight is not None:
         defaults["stochastic_event"] = {"weight": plain_options(options.stochastic_weight)}
     return Scenario(

@@ -135,12 +135,16 @@ class Sinusoids(InputSignal):
 
     def covariance(self, horizon: int) -> Array:
         """Return Σ a²/2 cos(2π lag / p) (horizon, q, q) for random phases, else zero."""
-        result = super().covariance(horizon)
-        if self.phase is None:
-            angle = 2.0 * np.pi / self.period * np.arange(horizon)
-            own = (0.5 * self.amplitude**2 * np.cos(angle)).sum(1)
-            result[:, np.arange(self.size), np.arange(self.size)] = own.T
-        return result
+        if self.phase is not None:
+            return super().covariance(horizon)
+        angle = 2.0 * np.pi / self.period * np.arange(horizon)
+        return _independent((0.5 * self.amplitude**2 * np.cos(angle)).sum(1))
+
+
+def _independent(own: Array) -> Array:
+    """Return covariances (horizon, q, q) of independent inputs from each one's (q, horizon)."""
+    result: Array = own.T[:, :, None] * np.eye(len(own))
+    return result
 
 
 def _terms(*values: ArrayLike) -> int:
@@ -194,9 +198,7 @@ class _Stationary(InputSignal):
 
     def _geometric(self, ratio: Array, horizon: int) -> Array:
         """Return a² ratio^lag (horizon, q, q) on the diagonal."""
-        own = self.amplitude**2 * ratio ** np.arange(horizon)
-        result: Array = own.T[:, :, None] * np.eye(self.size)
-        return result
+        return _independent(self.amplitude**2 * ratio ** np.arange(horizon))
 
 
 @dataclass(frozen=True)
