@@ -59,10 +59,14 @@ class Deliveries:
     held: Array
     age: Array
 
-    def after(self, arrived: NDArray[np.bool_], **changes: Any) -> Self:
-        """Return the state after packets (l, N) of measurements, with changes of other fields."""
-        xp = namespace(arrived, self.measurement)
-        held = xp.where(arrived[:, None], self.measurement, self.held)
+    def after(self, arrived: NDArray[np.bool_], sent: Array | None = None, **changes: Any) -> Self:
+        """Return the state after packets (l, N), with changes of other fields.
+
+        They carry what is ``sent`` (l, …, N), by default the measurements.
+        """
+        sent = self.measurement if sent is None else sent
+        xp = namespace(arrived, sent)
+        held = xp.where(arrived[:, None], sent, self.held)
         return replace(self, held=held, age=xp.where(arrived, 0.0, self.age), **changes)
 
 
@@ -76,19 +80,16 @@ class SensorPlant(Plant[StateT]):
     @property
     def sensor_count(self) -> int:
         """Number of sensors."""
-        count: int = self.sensors.count
-        return count
+        return self.sensors.count
 
     @property
     def noise_channels(self) -> int:
         """Normals of one step: process noise, then the sensors'."""
-        channels: int = self.dynamics.noise_channels + self.sensors.noise_channels
-        return channels
+        return self.dynamics.noise_channels + self.sensors.noise_channels
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
-        variances: Array = self.dynamics.open_loop(horizon)
-        return variances
+        return self.dynamics.open_loop(horizon)
 
 
 class AdoptingEstimator(Estimator[StateT]):
@@ -97,12 +98,8 @@ class AdoptingEstimator(Estimator[StateT]):
     def adopt(self, state: StateT, mean: Array, covariance: Array, runs: NDArray[Any]) -> StateT:
         """See :class:`Estimator`."""
         before: Any = state
-        adopted: StateT = replace(
-            before,
-            mean=np.where(runs, mean, before.mean),
-            covariance=np.where(runs, covariance, before.covariance),
-        )
-        return adopted
+        mean = np.where(runs, mean, before.mean)
+        return replace(before, mean=mean, covariance=np.where(runs, covariance, before.covariance))
 
 
 @dataclass(frozen=True)

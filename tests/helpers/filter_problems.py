@@ -88,6 +88,6 @@ def make_bound_filter(
         "divisor": np.linspace(4.0, 6.0, sensors.count),
         "initial": np.linspace(1.0, 2.0, sensors.count),
     }
-    error = EventError.create(**trigger, young=(1.5, 2.0), sensors=sensors.count)
+    error = EventError.create(trigger, (1.5, 2.0), sensors.count)
     constants = BoundConstants.create(epsilon)
     return BoundTobitFilter(sensors, constants, error if with_event_error else None, hold)

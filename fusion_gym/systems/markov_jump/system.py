@@ -304,14 +304,9 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         mean, noise_mean, innovation = self.filters.update(
             state.node_mean, measurement[:, 0], sampled, place
         )
+        seen = namespace(sampled, measurement).where(sampled[:, None], measurement, np.nan)
         return replace(
-            state,
-            measurement=namespace(sampled, measurement).where(
-                sampled[:, None], measurement, np.nan
-            ),
-            innovation=innovation,
-            node_mean=mean,
-            node_noise=noise_mean,
+            state, measurement=seen, innovation=innovation, node_mean=mean, node_noise=noise_mean
         )
 
     def update(self, state: MarkovJumpEstimate, reception: Reception) -> MarkovJumpEstimate:
@@ -323,12 +318,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         grant, xp = arrived[:, None], namespace(arrived)
         copy_mean = xp.where(grant, state.node_mean, state.copy_mean)
         fused = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(arrived))
-        return replace(
-            state,
+        return state.after(
+            arrived,
+            self._collapse(state.node_mean),
             copy_mean=copy_mean,
             copy_noise=xp.where(grant, state.node_noise, state.copy_noise),
-            held=xp.where(grant, self._collapse(state.node_mean), state.held),
-            age=xp.where(arrived, 0.0, state.age),
             mean=fused.mean,
             covariance=fused.covariance,
         )

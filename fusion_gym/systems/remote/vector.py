@@ -192,8 +192,7 @@ class VectorSources(NormalPlant, AgedSources[Truth]):
     def blocks(self, values: Array) -> Array:
         """Return values (n, N) of the states by source (l, s, N)."""
         xp = namespace(values)
-        result: Array = xp.concatenate((values, xp.zeros_like(values[:1])))[self.places]
-        return result
+        return xp.concatenate((values, xp.zeros_like(values[:1])))[self.places]
 
     def flat(self, values: Array) -> Array:
         """Return values (l, s, N) as values (n, N) of the states."""
@@ -206,8 +205,7 @@ class VectorSources(NormalPlant, AgedSources[Truth]):
         same = np.eye(count, dtype=np.bool_)[:, None, :, None, None]
         spread = namespace(blocks).where(same, blocks[:, :, None], 0.0)
         present = np.flatnonzero(self.places < len(self.state_names))
-        square: Array = spread.reshape(count * size, count * size, runs)
-        return square[present][:, present]
+        return spread.reshape(count * size, count * size, runs)[present][:, present]
 
     def predict_covariance(self, covariance: Array) -> Array:
         """Return A P Aᵀ + W of covariances P (l, s, s, N)."""
@@ -348,10 +346,9 @@ class VectorEstimator(Estimator[VectorEstimate]):
         """Replace the centre's prediction by the estimates that arrive."""
         arrived, xp = reception.arrived, namespace(reception.arrived, state.prior)
         grant = arrived[:, None]
-        return replace(
-            state,
-            held=xp.where(grant, state.node_mean, state.held),
-            age=xp.where(arrived, 0.0, state.age),
+        return state.after(
+            arrived,
+            state.node_mean,
             mean=xp.where(grant, state.node_mean, state.prior),
             blocks=xp.where(grant[:, None], self.model.posterior, state.prior_blocks),
         )
@@ -367,8 +364,7 @@ class VectorEstimator(Estimator[VectorEstimate]):
             least = (_FLOOR * linalg.diagonal(linalg.gram(self.model.process_factor))) + _FLOOR**2
             variance = linalg.diagonal(state.prior_blocks - self.model.posterior)
             xp = namespace(variance)
-            root: Array = xp.sqrt(xp.maximum(variance, least))
-            return root
+            return xp.sqrt(xp.maximum(variance, least))
 
         return {
             **super().read(state, failure),

@@ -33,19 +33,20 @@ _ROUNDS = 2  # a third changes errors by less than a thousandth
 _LEAST_SHARE = 1e-9  # of a variance; the rest of the difference is rounding
 
 
-class CentrePrediction(NamedTuple):
+class Prediction(NamedTuple):
     """The prediction of centre and nodes before a transmission.
 
     ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
-    (n, n, N) of the covariance without a transmission, and, where nodes have covariances of their
-    own, their ``outcomes`` z of x = x̂ + G z. A centre that uses held values has them as ``held``,
-    a hold its ``moment``; ``possible`` (sensors, N) are the sensors that the network would have
-    granted, ``None`` for all.
+    (n, n, N) of the covariance without a transmission, the centre's ``prior``, and, where nodes
+    have covariances of their own, their ``outcomes`` z of x = x̂ + G z. A centre that uses held
+    values has them as ``held``, a hold its ``moment``; ``possible`` (sensors, N) are the sensors
+    that the network would have granted, ``None`` for all.
     """
 
     expectation: Expectation
     deviation: Array
     root: Array
+    prior: Gaussian
     outcomes: Outcomes | None = None
     held: Any = None
     moment: Any = None
@@ -71,58 +72,50 @@ class Centre(Protocol):
     @property
     def sensors(self) -> CensoredSensors:
         """The sensors."""
-        sensors: CensoredSensors = self.filter.sensors
-        return sensors
+        return self.filter.sensors
 
     def at(self, step: Array) -> Self:
         """Return the centre with the matrices of its sensors at steps (N,)."""
-        own: Any = self
         sensors = self.sensors.at(step)
         if sensors is self.sensors:
             return self
-        return cast(Self, replace(own, filter=replace(self.filter, sensors=sensors)))
+        return replace(cast(Any, self), filter=replace(self.filter, sensors=sensors))
 
     @property
     def predictable(self) -> bool:
         """Whether the covariances depend on the deliveries only."""
         return False
 
-    def advance(self, model: LinearPlant, state: Any) -> tuple[Gaussian, CentrePrediction]:
-        """Return the prior and the prediction one step after a state's delivery."""
+    def advance(self, model: LinearPlant, state: Any) -> Prediction:
+        """Return the prediction one step after a state's delivery."""
         prior = model.predict(state.mean, state.covariance)
-        return prior, self.predict(*prior, state.held, state.time + 1.0)
+        return self.predict(prior, state.held, state.time + 1.0)
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
-        """Return the expectations under the centre's prediction (n, N), (n, n, N)."""
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
+        """Return the expectations under the centre's prior (n, N), (n, n, N)."""
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """Return mean (n, N) and covariance (n, n, N) after the grants (sensors, N)."""
 
-    def local_means(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Array:
+    def local_means(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
         """Return the nodes' means (sensors, n, N) before feedback; without nodes, the centre's."""
-        own = self.update(prior, prediction, measurement, granted)[0]
+        own = self.update(prediction, measurement, granted)[0]
         return np.broadcast_to(own, (len(granted), *own.shape))
 
-    def single(self, prior: Gaussian, prediction: CentrePrediction, measurement: Array) -> Gaussian:
+    def single(self, prediction: Prediction, measurement: Array) -> Gaussian:
         """Return means (sensors, n, N) and covariances (sensors, n, n, N) after single grants."""
         raise RuntimeError(f"{type(self).__name__} is not separable")
 
-    def variances(
-        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
         """Return a silent step's weighted fused trace (N,), and its reductions (sensors, N).
 
         A packet holds the expected measurement.
         """
-        count, runs = self.sensors.count, prior[0].shape[-1]
+        count, runs = self.sensors.count, prediction.root.shape[-1]
 
         def trace(granted: Packets) -> Array:
             packets = np.broadcast_to(granted[:, None], (count, runs))
-            posterior = self.update(prior, prediction, prediction.expectation.value, packets)
+            posterior = self.update(prediction, prediction.expectation.value, packets)
             return linalg.weighted_trace(posterior[1], weights)
 
         silent = trace(np.zeros(count, dtype=np.bool_))
@@ -193,36 +186,33 @@ class FeedbackCentre(NodeCentre):
 
     fusion: FusionRule
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`."""
-        expectation = self.filter.expect(mean)
-        root = linalg.root(self.sensors.regular(covariance))
+        expectation = self.filter.expect(prior[0])
+        root = linalg.root(self.sensors.regular(prior[1]))
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
         deviation = _deviation(self.sensors, expectation, linalg.total(observed * observed))
         share = self.share[:, None, None]
         inflated = observed / namespace(share).sqrt(share)
         outcomes = self.filter.outcomes(inflated, expectation, held, time)
-        return CentrePrediction(expectation, deviation, root, outcomes)
+        return Prediction(expectation, deviation, root, prior, outcomes)
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`; each node uses its planned outcome of a grant or of silence."""
         outcomes, root, share = _outcomes(prediction), prediction.root, self.share[:, None]
         both = outcomes.delivered_covariance, outcomes.silent_covariance
         own = namespace(granted).where(granted[:, None, None], *both)
         local = self._shift(prediction, measurement, granted)
         fused = self.fusion.fuse(local, own / share[:, None], basis=root)
-        return prior[0] + linalg.matvec(root, fused.mean), linalg.congruence(root, fused.covariance)
+        mean = prediction.prior[0] + linalg.matvec(root, fused.mean)
+        return mean, linalg.congruence(root, fused.covariance)
 
-    def local_means(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Array:
+    def local_means(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
         """See :class:`Centre`."""
         local = self._shift(prediction, measurement, granted)
-        return prior[0] + linalg.matvec(prediction.root, local)
+        return prediction.prior[0] + linalg.matvec(prediction.root, local)
 
-    def _shift(self, prediction: CentrePrediction, measurement: Array, granted: Packets) -> Array:
+    def _shift(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
         """Return the nodes' means (sensors, n, N) of z."""
         outcomes = _outcomes(prediction)
         innovation = measurement - prediction.expectation.value
@@ -231,9 +221,7 @@ class FeedbackCentre(NodeCentre):
         share = self.share[:, None]
         return local / namespace(share).sqrt(share)
 
-    def variances(
-        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
         """See :class:`Centre`; a filter that minimises a bound uses the bound."""
         outcomes, root = _outcomes(prediction), prediction.root
         share = self.share[:, None, None]
@@ -261,10 +249,10 @@ class FederatedCentre(NodeCentre):
     filter: KalmanFilter
     separable = True
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``held`` and ``time`` have no effect."""
         sensors, weight = self.sensors, self.filter.silence
-        expectation, root = self.filter.expect(mean), linalg.root(covariance)
+        expectation, root = self.filter.expect(prior[0]), linalg.root(prior[1])
         observed = linalg.matmul(sensors.measurement_matrix, root)
         deviation = _deviation(sensors, expectation, linalg.total(observed * observed))
         if weight is not None:
@@ -273,52 +261,45 @@ class FederatedCentre(NodeCentre):
             nothing = 0.0 * expectation.value
             _, silent = joint_update(_stack(scale[:, :, None] * observed), _stack(nothing))
             root = linalg.matmul(root, linalg.root(silent))
-        return CentrePrediction(expectation, deviation, root)
+        return Prediction(expectation, deviation, root, prior)
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
-        mean, covariance = prior
+        mean, covariance = prediction.prior
         xp, places = namespace(granted), active_rows(granted)
         silent = covariance if self.filter.silence is None else linalg.gram(prediction.root)
         if not places.size:
             return mean, silent
         matrix, value = self._whitened(prediction, measurement, places)
         matrix = xp.where(granted[places, None, None], matrix, 0.0)
-        mean, posterior = _shifted(mean, prediction, _stack(matrix), _stack(value))
+        mean, posterior = _shifted(prediction, _stack(matrix), _stack(value))
         return mean, xp.where(granted.any(0), posterior, silent)
 
-    def local_means(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Array:
+    def local_means(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
         """See :class:`Centre`."""
         sensors, expectation = self.sensors, prediction.expectation
         weighted = expectation.uncensored_probability[:, :, None] * sensors.measurement_matrix
-        cross = linalg.matmul(weighted, prior[1])
+        cross = linalg.matmul(weighted, prediction.prior[1])
         total = linalg.matmul(cross, linalg.transpose(weighted))
         noise = sensors.variance * expectation.truncated_variance
         total = linalg.add_diagonal(total, self.share[:, None] * noise)
         innovation = measurement - expectation.value
         innovation = namespace(innovation).where(granted[:, None], innovation, 0.0)
         shift = linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
-        return prior[0] + shift
+        return prediction.prior[0] + shift
 
-    def single(self, prior: Gaussian, prediction: CentrePrediction, measurement: Array) -> Gaussian:
+    def single(self, prediction: Prediction, measurement: Array) -> Gaussian:
         """See :class:`Centre`."""
-        whitened = self._whitened(prediction, measurement, slice(None))
-        return _shifted(prior[0], prediction, *whitened)
+        return _shifted(prediction, *self._whitened(prediction, measurement, slice(None)))
 
-    def variances(
-        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
         """See :class:`Centre`."""
         silent = linalg.weighted_trace(linalg.gram(prediction.root), weights)
-        single = self.single(prior, prediction, prediction.expectation.value)[1]
+        single = self.single(prediction, prediction.expectation.value)[1]
         return silent, silent - linalg.weighted_trace(single, weights)
 
     def _whitened(
-        self, prediction: CentrePrediction, measurement: Array, places: Any
+        self, prediction: Prediction, measurement: Array, places: Any
     ) -> tuple[Array, Array]:
         """Return N^-½ q C G (…, m, n, N) and N^-½ (y - ŷ): deliveries with unit noise."""
         sensors, expectation, weight = self.sensors, prediction.expectation, self.filter.silence
@@ -340,29 +321,25 @@ class SequentialCentre(Centre):
     filter: AssumedDensityFilter
     predicts = True
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``held`` and ``time`` have no effect."""
-        root = linalg.root(covariance)
-        expectation = self.filter.expect(mean, root)
+        root = linalg.root(prior[1])
+        expectation = self.filter.expect(prior[0], root)
         floor = 1e-3 * self.sensors.variance
         deviation = namespace(root).sqrt(expectation.noise_variance + floor)
-        return CentrePrediction(expectation, deviation, root)
+        return Prediction(expectation, deviation, root, prior)
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
-        mean, covariance = prior
+        mean, covariance = prediction.prior
         mean, root = self.filter.update(mean, prediction.root, measurement, granted)
         fused = namespace(granted).where(granted.any(0), linalg.gram(root), covariance)
         return mean, fused
 
-    def variances(
-        self, prior: Gaussian, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
         """See :class:`Centre`; the reduction is the expected one."""
-        silent = linalg.weighted_trace(prior[1], weights)
-        expected = self.filter.expected_covariance(prior[0], prediction.root)
+        silent = linalg.weighted_trace(prediction.prior[1], weights)
+        expected = self.filter.expected_covariance(prediction.prior[0], prediction.root)
         return silent, silent - linalg.weighted_trace(expected, weights)
 
 
@@ -378,16 +355,14 @@ def _stack(values: Array) -> Array:
     return values.reshape(-1, *values.shape[2:])
 
 
-def _shifted(
-    mean: Array, prediction: CentrePrediction, matrix: Array, value: Array
-) -> tuple[Array, Array]:
+def _shifted(prediction: Prediction, matrix: Array, value: Array) -> Gaussian:
     """Return mean and covariance of x = x̂ + G z after :func:`joint_update` of z."""
     shift, covariance = joint_update(matrix, value)
     root = prediction.root
-    return mean + linalg.matvec(root, shift), linalg.congruence(root, covariance)
+    return prediction.prior[0] + linalg.matvec(root, shift), linalg.congruence(root, covariance)
 
 
-def _outcomes(prediction: CentrePrediction) -> Outcomes:
+def _outcomes(prediction: Prediction) -> Outcomes:
     if prediction.outcomes is None:
         raise RuntimeError("the prediction has no outcomes: another centre made it")
     return prediction.outcomes
@@ -420,11 +395,9 @@ class JointCentre(FederatedCentre):
     Source: B. D. O. Anderson and J. B. Moore, "Optimal Filtering", 1979, chapter 3.
     """
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
-        mean, covariance = prior
+        mean, covariance = prediction.prior
         xp, sensors, runs = namespace(granted), self.sensors, granted.shape[-1]
         every = xp.repeat(granted, sensors.size, axis=0)
         channels = active_rows(every)
@@ -514,40 +487,38 @@ class HoldCentre(Centre):
         both = np.concatenate([still, matrix])[..., None]
         return motion[..., None], linalg.congruence(both, self.plant.process_covariance)
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; the prediction of the start, when every value is delivered."""
+        mean, covariance = prior
         n, channels = self.inverse.shape[:2]
         moment = np.zeros((n + channels, n + channels, mean.shape[-1]))
         moment[:n, :n] = covariance + linalg.outer(mean, mean)
-        return self._predict((mean, covariance), held, moment)
+        return self._predict(prior, held, moment)
 
-    def advance(self, model: LinearPlant, state: Any) -> tuple[Gaussian, CentrePrediction]:
+    def advance(self, model: LinearPlant, state: Any) -> Prediction:
         """See :class:`Centre`; the estimate stays."""
         before = state.prediction
         if before is None:
             runs, plant = state.mean.shape[-1], self.plant
             first = (plant.initial_mean, plant.initial_covariance)
             mean, covariance = (np.repeat(values, runs, axis=-1) for values in first)
-            before = self.predict(mean, covariance, state.held, state.time)
+            before = self.predict((mean, covariance), state.held, state.time)
         transition, noise = self.motion
         moment = self._delivered(before.moment, state.age == 0.0)
         moment = linalg.congruence(transition, moment) + noise
-        prior = state.mean, self._covariance(moment)
-        return prior, self._predict(prior, state.held, moment)
+        return self._predict((state.mean, self._covariance(moment)), state.held, moment)
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
         held = np.where(granted[:, None], measurement, prediction.held)
         mean = linalg.matvec(self.inverse, held.reshape(-1, held.shape[-1]))
         return mean, self._covariance(self._delivered(prediction.moment, granted))
 
-    def _predict(self, prior: Gaussian, held: Array, moment: Array) -> CentrePrediction:
+    def _predict(self, prior: Gaussian, held: Array, moment: Array) -> Prediction:
         expectation, root = self.filter.expect(prior[0]), linalg.root(prior[1])
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
         spread = linalg.total(observed * observed) + self.sensors.variance
-        return CentrePrediction(expectation, np.sqrt(spread), root, held=held, moment=moment)
+        return Prediction(expectation, np.sqrt(spread), root, prior, held=held, moment=moment)
 
     def _delivered(self, moment: Array, granted: Packets) -> Array:
         """Return Σ after the deliveries (sensors, N)."""
@@ -645,15 +616,13 @@ class TruncatedCentre(FederatedCentre):
     local_means = Centre.local_means
     variances = Centre.variances
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``time`` has no effect."""
-        return super().predict(mean, covariance, held, time)._replace(held=held)
+        return super().predict(prior, held, time)._replace(held=held)
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
-        mean, covariance = super().update(prior, prediction, measurement, granted)
+        mean, covariance = super().update(prediction, measurement, granted)
         silent = ~granted if prediction.possible is None else ~granted & prediction.possible
         silent = silent & (self.silence.threshold > 0.0)
         if not silent.any():
@@ -710,7 +679,5 @@ def truncated_centre(options: Any, sensors: CensoredSensors) -> TruncatedCentre:
     if not sensors.unlimited:
         allowed = "'kalman', 'tobit' or 'adf' with censored sensors"
         raise refusal("filter", "truncated", allowed)
-    silence = Silence.create(
-        options.trigger, options.trigger_threshold, sensors.count, sensors.size
-    )
+    silence = Silence.create(options, sensors.count, sensors.size)
     return TruncatedCentre(KalmanFilter(sensors), np.ones((sensors.count, 1)), silence)

@@ -18,6 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -576,21 +577,13 @@ class EventError:
 
     @classmethod
     def create(
-        cls,
-        threshold: ArrayLike,
-        decay: ArrayLike,
-        divisor: ArrayLike,
-        initial: ArrayLike,
-        young: tuple[float, float],
-        sensors: int,
+        cls, trigger: Mapping[str, ArrayLike], young: tuple[float, float], sensors: int
     ) -> EventError:
         """Return the bound of a dynamic event trigger.
 
         Args:
-            threshold: σ of each sensor, >= 0.
-            decay: λ of each sensor, >= 0.
-            divisor: χ of each sensor, > 0.
-            initial: η₀ of each sensor, >= 0.
+            trigger: ``threshold`` σ, ``decay`` λ and ``initial`` η₀ of each sensor, >= 0, and
+                ``divisor`` χ, > 0.
             young: the factors (d, e) of Young's inequality, > 0.
             sensors: number of sensors.
 
@@ -598,10 +591,11 @@ class EventError:
             ConfigurationError: a wrong shape, or a number outside these limits.
         """
         shape = (sensors,)
-        sigma = validation.not_negative("trigger_threshold", threshold, shape)
-        lam = validation.not_negative("trigger_decay", decay, shape)
-        chi = validation.positive("trigger_divisor", divisor, shape)
-        eta = validation.not_negative("trigger_initial", initial, shape)
+        sigma, lam, eta = (
+            validation.not_negative(f"trigger_{name}", trigger[name], shape)
+            for name in ("threshold", "decay", "initial")
+        )
+        chi = validation.positive("trigger_divisor", trigger["divisor"], shape)
         d, e = validation.positive("bound_young", young, (2,))
         growth = (1 + d) * (1 + e) * lam**2 + (1 + chi) * (1 + 1 / d) / chi**2
         offset = ((1 + d) * (1 + 1 / e) + (1 + 1 / d) * (1 + 1 / chi)) * sigma**2

@@ -179,7 +179,7 @@ def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> 
         allowed = f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound"
         raise validation.refusal("bound_epsilon", options.bound_epsilon, allowed)
     trigger = _trigger(options, sensors.count)
-    error = EventError.create(**trigger, young=options.bound_young, sensors=sensors.count)
+    error = EventError.create(trigger, options.bound_young, sensors.count)
     with_error = options.event_error is None or options.event_error
     hold = options.silent != "predict"
     if with_error and options.filter == "paper":

@@ -36,9 +36,9 @@ from fusion_gym.systems.linear_plant import (
 from fusion_gym.systems.solvable import LinearEstimator, LinearProblem
 from fusion_gym.systems.tobit.centres import (
     Centre,
-    CentrePrediction,
     FederatedCentre,
     FeedbackCentre,
+    Prediction,
     SequentialCentre,
     information_shares,
 )
@@ -167,8 +167,7 @@ class DailyLevel:
 
     def reading(self, deviation: Array, level: Array) -> Array:
         """Return the reading (l, 1, N) without rounding errors, which would count as changes."""
-        result: Array = np.round((deviation + level) / self.quantum) * self.quantum
-        return result
+        return np.round((deviation + level) / self.quantum) * self.quantum
 
 
 @dataclass(slots=True)
@@ -184,7 +183,7 @@ class CensoredEstimate(parts.Deliveries):
     time: Array
     prior_mean: Array
     prior_covariance: Array
-    prediction: CentrePrediction | None
+    prediction: Prediction | None
     mean: Array
     covariance: Array
     day: Array | None = None
@@ -288,7 +287,7 @@ class CensoredEstimator(
             measurement_variance: R (sensors, m).
             information_shares: (sensors,), of sum 1.
         """
-        model, centre = self.model, self.centre
+        model, centre = self.model, cast(Any, self.centre)
         if process_covariance is not None:
             model.refuse_schedule("with another process covariance")
             model = replace(model, process_covariance=process_covariance[..., None])
@@ -297,10 +296,9 @@ class CensoredEstimator(
             variance = measurement_variance[..., None]
             deviation = namespace(variance).sqrt(variance)
             sensors = replace(centre.sensors, variance=variance, deviation=deviation)
-            node: Any = cast(Any, centre).filter
-            centre = replace(cast(Any, centre), filter=replace(node, sensors=sensors))
+            centre = replace(centre, filter=replace(centre.filter, sensors=sensors))
         if information_shares is not None:
-            centre = replace(cast(Any, centre), share=information_shares[:, None])
+            centre = replace(centre, share=information_shares[:, None])
         return replace(self, model=model, centre=centre)
 
     @property
@@ -361,11 +359,11 @@ class CensoredEstimator(
             return first
         if self.level is not None:
             filled = np.nan_to_num(measurement)
-            first.prediction = self.centre.predict(mean, covariance, filled, first.time)
+            first.prediction = self.centre.predict((mean, covariance), filled, first.time)
             first = self.observe(first, measurement)
             first.held = first.measurement
         centre = self.centre.at(first.time)
-        prediction = centre.predict(mean, covariance, first.held, first.time)
+        prediction = centre.predict((mean, covariance), first.held, first.time)
         everyone = xp.ones((sensors.count, runs), dtype=np.bool_)
         result = self.update(replace(first, prediction=prediction), Reception(everyone))
         return replace(result, prediction=None, age=first.age)
@@ -380,15 +378,10 @@ class CensoredEstimator(
             held = held - (self._level(state, time) - self._level(state, state.time))
             state = replace(state, held=held)
         model, centre = self.model.at(state.time), self.centre.at(time)
-        (prior_mean, prior_covariance), prediction = centre.advance(model, state)
-        return replace(
-            state,
-            age=state.age + 1.0,
-            time=time,
-            prior_mean=prior_mean,
-            prior_covariance=prior_covariance,
-            prediction=prediction,
-        )
+        prediction = centre.advance(model, state)
+        mean, covariance = prediction.prior
+        state = replace(state, prior_mean=mean, prior_covariance=covariance, prediction=prediction)
+        return replace(state, age=state.age + 1.0, time=time)
 
     def observe(self, state: CensoredEstimate, measurement: Array) -> CensoredEstimate:
         """See :class:`Estimator`; a sensor without a reading has the expectation."""
@@ -404,14 +397,14 @@ class CensoredEstimator(
 
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
-        prior, prediction = (state.prior_mean, state.prior_covariance), sensed(state.prediction)
+        prediction = sensed(state.prediction)
         if self.reads_silence:
             prediction = prediction._replace(possible=reception.possible)
         arrived = reception.arrived
         if state.available is not None:
             arrived = arrived & state.available
         centre = self.centre.at(state.time)
-        mean, covariance = centre.update(prior, prediction, state.measurement, arrived)
+        mean, covariance = centre.update(prediction, state.measurement, arrived)
         return state.after(arrived, prediction=prediction, mean=mean, covariance=covariance)
 
     def single_deliveries(self, state: CensoredEstimate) -> tuple[Array, Array] | None:
@@ -419,8 +412,7 @@ class CensoredEstimator(
         centre = self.centre.at(state.time)
         if not centre.separable:
             return None
-        prior = state.prior_mean, state.prior_covariance
-        means, covariances = centre.single(prior, sensed(state.prediction), state.measurement)
+        means, covariances = centre.single(sensed(state.prediction), state.measurement)
         if state.available is not None:
             silent = self.update(state, Reception(np.zeros_like(state.available))).covariance
             covariances = np.where(state.available[:, None, None], covariances, silent)
@@ -432,9 +424,8 @@ class CensoredEstimator(
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
-            prior = state.prior_mean, state.prior_covariance
             centre = self.centre.at(state.time)
-            return centre.variances(prior, sensed(state.prediction), self.state_weights)
+            return centre.variances(sensed(state.prediction), self.state_weights)
 
         values: dict[str, Any] = {
             **super().read(state, failure),
@@ -460,8 +451,7 @@ class CensoredEstimator(
 
     def _level(self, state: CensoredEstimate, time: Array) -> Array:
         level: Any = self.level
-        result: Array = level.at(state.day, time)
-        return result
+        return level.at(state.day, time)
 
     def _log_variance(self, state: CensoredEstimate) -> Array:
         variances = (linalg.diagonal(state.prior_covariance), self.reference[:, None])
@@ -474,9 +464,8 @@ class CensoredEstimator(
         """Return the nodes' posterior means (sensors, n, N) before the feedback."""
         if state.prediction is None:
             return super().local_means(state)
-        prior, arrived = (state.prior_mean, state.prior_covariance), state.age == 0.0
-        centre = self.centre.at(state.time)
-        return centre.local_means(prior, state.prediction, state.measurement, arrived)
+        centre, arrived = self.centre.at(state.time), state.age == 0.0
+        return centre.local_means(state.prediction, state.measurement, arrived)
 
 
 def _whitened(state: CensoredEstimate) -> Array:

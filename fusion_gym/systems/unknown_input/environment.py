@@ -345,7 +345,7 @@ def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSig
 
 def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:
     kind = validation.choice("filter", options.filter, FILTERS)
-    factor = validation.positive("young_factor", options.young_factor, (sensors.count,))
+    validation.positive("young_factor", options.young_factor, (sensors.count,))
     model = filters.InputModel.create(plant, options)
     joint = filters.JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
@@ -356,8 +356,7 @@ def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizo
         reason = "it belongs to filter='random_walk'"
         raise forbidden("hold_variance", hold, reason, f"with filter={kind!r}")
     if kind == "paper":
-        bound = options.rho_bar
-        tables = filters.BoundTables.create(joint, model, bound, factor, horizon)
+        tables = filters.BoundTables.create(joint, model, options, horizon)
         return TableNodes.create(model, sensors, tables, fusion)
     if kind == "predict":
         exact = filters.ExactInputStateFilter(model, joint)
@@ -394,8 +393,7 @@ def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Arr
     share[len(share) - inputs :] = validation.number(
         "input_weight", options.input_weight, at_least=0.0
     )
-    weights: Array = share / (share.sum() * open_loop)
-    return weights
+    return share / (share.sum() * open_loop)
 
 
 def _state_names(options: UnknownInputOptions, plant: UnknownInputPlant) -> tuple[str, ...]:

@@ -143,8 +143,7 @@ class Sinusoids(InputSignal):
 
 def _independent(own: Array) -> Array:
     """Return covariances (horizon, q, q) of independent inputs from each one's (q, horizon)."""
-    result: Array = own.T[:, :, None] * np.eye(len(own))
-    return result
+    return own.T[:, :, None] * np.eye(len(own))
 
 
 def _terms(*values: ArrayLike) -> int:
@@ -440,11 +439,8 @@ class InputSensors(Sensors):
         shape = None, None, plant.size
         c = validation.array("measurement_matrices", options.measurement_matrices, shape)
         noise = _noise_covariances(options.measurement_covariance, *c.shape[:2])
-        inverses, complements = [], []
-        for sensor, matrix in enumerate(c):
-            inverse, complement = _observable_input(sensor, matrix, plant)
-            inverses.append(inverse)
-            complements.append(complement)
+        parts = [_observable_input(sensor, matrix, plant) for sensor, matrix in enumerate(c)]
+        inverses, complements = zip(*parts, strict=True)
         return cls(
             measurement_matrix=c[..., None],
             covariance=noise[..., None],

@@ -132,8 +132,7 @@ def test_expected_reduction_is_the_mean_over_the_measurements() -> None:
         state.prior_mean[:, 0], state.prior_covariance[..., 0], draws
     ).T
     measurement = centre.sensors.measure(truth, generator.normal(size=(2, draws)))
-    prior, weights = (state.prior_mean, state.prior_covariance), estimator.state_weights
-    silent, reduction = centre.variances(prior, state.prediction, weights)
+    silent, reduction = centre.variances(state.prediction, estimator.state_weights)
     for sensor in range(2):
         granted = np.zeros((2, draws), dtype=np.bool_)
         granted[sensor] = True

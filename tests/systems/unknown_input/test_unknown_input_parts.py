@@ -114,10 +114,16 @@ def test_paper_gain_is_exact_to_rounding() -> None:
 def test_bound_tables_have_their_radius_and_grow_by_silence() -> None:
     plant = random_plant(18, n=3, q=1)
     sensors = random_sensors(19, plant, count=2, size=3)
-    options = UnknownInputOptions(input_memory=0.9, input_change=0.3, input_deviation=0.7)
-    joint, model = JointGain.create(plant, sensors), InputModel.create(plant, options)
     epsilon = (0.3, 0.1)
-    tables = BoundTables.create(joint, model, (0.05, 0.2), epsilon, 12)
+    options = UnknownInputOptions(
+        input_memory=0.9,
+        input_change=0.3,
+        input_deviation=0.7,
+        rho_bar=(0.05, 0.2),
+        young_factor=epsilon,
+    )
+    joint, model = JointGain.create(plant, sensors), InputModel.create(plant, options)
+    tables = BoundTables.create(joint, model, options, 12)
     for sensor in range(2):
         observed = tables.gain[sensor, :3, ..., 12] @ sensors.measurement_matrix[sensor, ..., 0]
         moved = np.sqrt(1 + epsilon[sensor]) * (np.eye(3) - observed) @ plant.transition[..., 0]
