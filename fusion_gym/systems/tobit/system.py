@@ -19,9 +19,8 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import Block, Signal, age_block, common_signals, numbered, sensed
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.options import PaperOptions, Scenario
-from fusion_gym.core.plant import Plant
+from fusion_gym.core.plant import AS_ASSUMED, Nature, Plant, true_noise
+from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
