@@ -23,7 +23,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.output import palette
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
-from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
+from fusion_gym.systems.markov_jump.linear_minimum_variance import LagRecursion
 
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")

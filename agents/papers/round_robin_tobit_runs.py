@@ -14,10 +14,9 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
 from fusion_gym.policies.base import Policy
-from fusion_gym.systems.tobit.centre import FederatedCentre
-from fusion_gym.systems.tobit.filters import Expectation
+from fusion_gym.systems.tobit.centres import FederatedCentre
+from fusion_gym.systems.tobit.filters import Expectation, TobitKalmanFilter, censored_moments
 from fusion_gym.systems.tobit.system import CensoredEstimator
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter, censored_moments
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
 TRACKING = "fusion_gym/BiasedTracking-v1"

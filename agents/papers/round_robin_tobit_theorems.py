@@ -17,7 +17,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options, Plain
 from fusion_gym.policies.base import Policy
-from fusion_gym.systems.tobit.tobit_filter import expect_censored
+from fusion_gym.systems.tobit.filters import TobitKalmanFilter
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them
@@ -73,7 +73,7 @@ def _lemma(episodes: int, seed: int) -> Plain:
     drawn = np.array([sensors.measure(state, noise)[0, 0] for state in repeated])
     spread, fourth = drawn.var(1, ddof=1), stats.moment(drawn, 4, axis=1)
     means = np.broadcast_to(truth, (sensors.count, *truth.shape))
-    right = expect_censored(sensors, means)
+    right = TobitKalmanFilter(sensors).expect(means)
     printed = measures.PrintedTobitFilter(sensors, "theta").expect(means)
     return {
         "mean": drawn.mean(1), "mean_error": np.sqrt(spread / draws), "variance": spread,

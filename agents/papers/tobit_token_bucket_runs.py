@@ -96,7 +96,7 @@ def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = 
         before, tokens = batch.state.estimate, batch.tokens
         outcome = batch.step(requests)
         (truth, state, *_), granted = batch.delivered, outcome.granted
-        expected, _, root, planned = state.prediction[:4]
+        expected, _, root, _, planned = state.prediction[:5]
         local = estimator.local_means(state)
         bound = np.full((*local.shape[:2], *state.covariance.shape[1:]), np.nan)
         if planned is not None:

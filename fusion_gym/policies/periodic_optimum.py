@@ -16,7 +16,7 @@ from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests, Stateless
-from fusion_gym.systems.correlated.system import CorrelatedTrackingEstimator
+from fusion_gym.systems.solvable import BoundingEstimator
 
 _MOST = 200_000  # schedules of one search
 _TOGETHER = 4096  # schedules in one batch
@@ -178,7 +178,7 @@ class _Still:
     def __init__(self, task: Task, schedules: Patterns) -> None:
         estimator: Any = task.estimator
         self._covariance: Callable[[Any], Array] = estimator.covariance
-        if isinstance(estimator, CorrelatedTrackingEstimator):
+        if isinstance(estimator, BoundingEstimator):
             estimator = estimator.with_actual_covariance()
             self._covariance = estimator.error_covariance
         self._plant, self._estimator = task.plant, estimator

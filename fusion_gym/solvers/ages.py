@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import linalg, validation
+from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import Channel, ChannelOptions
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.single import iterate_values
-from fusion_gym.systems.remote.vector import VectorSources
+from fusion_gym.systems.solvable import AgedSources
 from fusion_gym.validation import ConfigurationError
 
 _LAZINESS = 0.3  # weight of the old value, because optimal schedules are periodic
@@ -52,19 +52,15 @@ def age_sources(task: Task, longest: int = _LONGEST) -> tuple[AgeSource, ...]:
         ConfigurationError: another plant, or an infinite cost of a source that always transmits.
     """
     model, network = task.plant, task.network
-    if not isinstance(model, VectorSources):
+    if not isinstance(model, AgedSources):
         raise validation.refusal("sources", None, "vector sources", "for costs by age")
     channel = network.channel or Channel(ChannelOptions(), task.sensors)
-    weights = model.blocks(task.reward.error_weight * task.reward.state_weights)[..., 0]
-    covariance, costs = model.posterior, []
-    for _ in range(longest + _BEYOND):
-        costs.append((weights * linalg.diagonal(covariance)[..., 0]).sum(1))
-        covariance = model.predict_covariance(covariance)
+    weights = task.reward.error_weight * task.reward.state_weights
+    costs = model.age_costs(weights, longest + _BEYOND)
     links = network.slots if network.rule.by_channel else 1
-    every = [own for own in np.array(costs).T for _ in range(links)]
-    radii = [np.abs(np.linalg.eigvals(matrix)).max() for matrix in model.transition[..., 0]]
+    every = [own for own in costs.T for _ in range(links)]
     price = (task.reward.price.fixed or 0.0) * network.bucket.cost[:, 0]
-    for place, growth in enumerate(np.square(radii)):
+    for place, growth in enumerate(np.square(model.radii)):
         own = channel.drop[:, links * place : links * (place + 1)].min(1)  # of the best channel
         loss = np.abs(np.linalg.eigvals(channel.transition * own)).max()
         if growth * loss >= 1.0:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import AverageSolution, FiniteSolution, solve_average, solve_finite
 from fusion_gym.solvers.source import ErrorGrid, SourceProblem, TokenLevels
-from fusion_gym.systems.remote.system import ScalarSources
+from fusion_gym.systems.solvable import IndependentSources
 
 CRITERIA = ("finite", "average")
 
@@ -81,8 +82,8 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     )
 
 
-def _sources(task: Task) -> ScalarSources:
-    if not isinstance(task.plant, ScalarSources):
+def _sources(task: Task) -> IndependentSources[Any]:
+    if not isinstance(task.plant, IndependentSources):
         raise validation.ConfigurationError(
             f"plant = {type(task.plant).__name__} is not allowed: it must be remote estimation"
         )

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, StateT
-from fusion_gym.core.knowledge import Block
+from fusion_gym.core.knowledge import Block, log_deviation
 from fusion_gym.core.plant import Plant
 from fusion_gym.namespace import namespace
 
@@ -59,10 +59,14 @@ class Deliveries:
     held: Array
     age: Array
 
-    def after(self, arrived: NDArray[np.bool_], **changes: Any) -> Self:
-        """Return the state after packets (l, N) of measurements, with changes of other fields."""
-        xp = namespace(arrived, self.measurement)
-        held = xp.where(arrived[:, None], self.measurement, self.held)
+    def after(self, arrived: NDArray[np.bool_], sent: Array | None = None, **changes: Any) -> Self:
+        """Return the state after packets (l, N), with changes of other fields.
+
+        They carry what is ``sent`` (l, …, N), by default the measurements.
+        """
+        sent = self.measurement if sent is None else sent
+        xp = namespace(arrived, sent)
+        held = xp.where(arrived[:, None], sent, self.held)
         return replace(self, held=held, age=xp.where(arrived, 0.0, self.age), **changes)
 
 
@@ -76,19 +80,16 @@ class SensorPlant(Plant[StateT]):
     @property
     def sensor_count(self) -> int:
         """Number of sensors."""
-        count: int = self.sensors.count
-        return count
+        return self.sensors.count
 
     @property
     def noise_channels(self) -> int:
         """Normals of one step: process noise, then the sensors'."""
-        channels: int = self.dynamics.noise_channels + self.sensors.noise_channels
-        return channels
+        return self.dynamics.noise_channels + self.sensors.noise_channels
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
-        variances: Array = self.dynamics.open_loop(horizon)
-        return variances
+        return self.dynamics.open_loop(horizon)
 
 
 class AdoptingEstimator(Estimator[StateT]):
@@ -97,12 +98,8 @@ class AdoptingEstimator(Estimator[StateT]):
     def adopt(self, state: StateT, mean: Array, covariance: Array, runs: NDArray[Any]) -> StateT:
         """See :class:`Estimator`."""
         before: Any = state
-        adopted: StateT = replace(
-            before,
-            mean=np.where(runs, mean, before.mean),
-            covariance=np.where(runs, covariance, before.covariance),
-        )
-        return adopted
+        mean = np.where(runs, mean, before.mean)
+        return replace(before, mean=mean, covariance=np.where(runs, covariance, before.covariance))
 
 
 @dataclass(frozen=True)
@@ -128,13 +125,13 @@ class ScaledEstimator(Estimator[StateT]):
         return estimate_block(meaning, mean, self.state_names, self.magnitude)
 
     def deviation_block(
-        self, name: str, meaning: str, value: Callable[[Any], Array], *nodes: tuple[str, ...]
+        self, name: str, whose: str, covariance: Callable[[Any], Array], *nodes: tuple[str, ...]
     ) -> Block:
         """Return a block of logarithms of deviations, of the centre or of ``nodes``."""
         return Block(
             name,
-            meaning,
-            value,
+            f"logarithm of {whose} over the open-loop deviation",
+            lambda state: log_deviation(covariance(state), self.reference),
             (*nodes, self.state_names),
             node="own" if nodes else "hidden",
             limit=RANGE,

@@ -49,8 +49,7 @@ class Scheduled:
         """Return the part with its matrices (…, N) at steps (N,)."""
         if self.schedule is None:
             return self
-        own: Any = self
-        return cast(Self, replace(own, schedule=None, **self.schedule.at(step)))
+        return replace(cast(Any, self), schedule=None, **self.schedule.at(step))
 
     @property
     def period(self) -> int:

@@ -50,14 +50,11 @@ class Silence:
     threshold: Array
 
     @classmethod
-    def create(
-        cls, trigger: Trigger | None, threshold: Any, sensors: int, channels: int
-    ) -> Silence:
+    def create(cls, options: Any, sensors: int, channels: int) -> Silence:
         """Return the silence of the options ``trigger`` and ``trigger_threshold``.
 
         Args:
-            trigger: name of the policy.
-            threshold: one number >= 0 or one per sensor.
+            options: name of the policy, and one number >= 0 or one per sensor.
             sensors: number of sensors.
             channels: number of channels of a sensor.
 
@@ -65,6 +62,7 @@ class Silence:
             ConfigurationError: an option is missing or not allowed, or a sensor has several
                 channels and the trigger is not ``report_on_change``.
         """
+        trigger, threshold = options.trigger, options.trigger_threshold
         if trigger is None or threshold is None:
             missing = "trigger" if trigger is None else "trigger_threshold"
             allowed = "that of the policy whose silence the filter reads"

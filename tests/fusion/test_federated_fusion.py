@@ -9,11 +9,10 @@ from parts import Parts
 
 from fusion_gym import ConfigurationError
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.centre import FederatedCentre, information_shares
-from fusion_gym.systems.tobit.filters import KalmanFilter
+from fusion_gym.systems.tobit.centres import FederatedCentre, information_shares
+from fusion_gym.systems.tobit.filters import KalmanFilter, TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 UNEQUAL = (0.5, 0.3, 0.2)
 MATRICES = np.array([[[1.0, 0.0], [0.3, 1.0]], [[0.0, 1.0], [1.0, -1.0]], [[1.0, 2.0], [0.0, 0.5]]])

@@ -6,8 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
-from fusion_gym.systems.tobit.filters import NodeFilter
+from fusion_gym.systems.tobit.filters import (
+    BoundConstants,
+    BoundTobitFilter,
+    EventError,
+    NodeFilter,
+)
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 Array = NDArray[np.float64]
@@ -84,6 +88,6 @@ def make_bound_filter(
         "divisor": np.linspace(4.0, 6.0, sensors.count),
         "initial": np.linspace(1.0, 2.0, sensors.count),
     }
-    error = EventError.create(**trigger, young=(1.5, 2.0), sensors=sensors.count)
+    error = EventError.create(trigger, (1.5, 2.0), sensors.count)
     constants = BoundConstants.create(epsilon)
     return BoundTobitFilter(sensors, constants, error if with_event_error else None, hold)

@@ -18,6 +18,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import present_id
 from fusion_gym.errors import DivergenceError
 from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 
@@ -187,9 +188,16 @@ def test_no_error_without_transmissions_is_negative(place: float, share: float) 
     """A Markov jump plant whose modes move alike has the variances of a plant without modes."""
     start, noise = share * np.eye(2), np.diag([0.0, 0.3])
     transition, mean = np.array([[0.9, 0.1], [0.0, 0.5]]), [place, place]
-    plant = MarkovJumpPlant.create(
-        [transition] * 2, [np.eye(2)] * 2, noise, [[0.7, 0.3], [0.1, 0.9]], [0.2, 0.8], mean, start
+    options = MarkovJumpTrackingOptions(
+        transitions=[transition] * 2,
+        process_gains=[np.eye(2)] * 2,
+        process_covariance=noise,
+        mode_transition=[[0.7, 0.3], [0.1, 0.9]],
+        initial_probabilities=[0.2, 0.8],
+        initial_mean=mean,
+        initial_covariance=start,
     )
+    plant = MarkovJumpPlant.create(options)
     sensors = make_task("fusion_gym/MarkovJumpTracking-v1").plant.sensors
     expected = LinearPlant.create(transition, noise, mean, start).open_loop(50)
     result = AugmentedModel.create(plant, sensors).open_loop(50)

@@ -75,7 +75,7 @@ class Silence(Action):
 '''
 BUCKET = "core/token_bucket.py"
 RESULTS, METRICS = "evaluation/episodes.py", "evaluation/metrics.py"
-TOBIT, LINEAR = "systems/tobit/options.py", "systems/tobit/linear.py"
+TOBIT, LINEAR = "systems/tobit/system.py", "systems/tobit/linear.py"
 ADDITIONS = {
     "a rule": Addition(
         "assert fusion_gym.make_policy('old_news:steps=4', oscillator).steps == 4\n"
@@ -116,7 +116,7 @@ ADDITIONS = {
         lines=(
             (
                 LINEAR,
-                "    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)",
+                "    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)",
                 "    initial_variance: float = 1.0",
             ),
             (
@@ -191,7 +191,7 @@ ADDITIONS = {
         (
             (
                 TOBIT,
-                "from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude",
+                "from fusion_gym.systems.tobit.sensors import CensoredSensors",
                 "from fusion_gym.systems.tobit.doubtful import DoubtfulFilter",
             ),
             (TOBIT, "FILTERS = {", '    "doubtful": at_the_nodes(DoubtfulFilter),'),

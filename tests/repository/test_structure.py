@@ -91,6 +91,23 @@ def test_imports_run_downwards(module: str) -> None:
             assert len(set(families)) <= 1, f"{module} imports {other} of another family"
 
 
+def test_only_the_registration_knows_the_families_of_systems() -> None:
+    """It has their names; others ask for the classes of fusion_gym/systems/solvable.py."""
+    home = "fusion_gym.systems."
+    families = {
+        n for n, path in modules().items() if n.startswith(home) and path.stem == "__init__"
+    }
+    users = {"fusion_gym", "fusion_gym.envs.registration"}
+    users |= {"fusion_gym.recordings.environment"}  # it extends LinearFusion
+    users |= {"fusion_gym.jax"}  # of Tobit estimators, whose parameters it optimises
+    assert families
+    for module in modules().keys() - users:
+        for other in imports(module):
+            family = ".".join(other.split(".")[:3])
+            inside = module.startswith((f"{family}.", "agents."))
+            assert family not in families or inside, f"{module} imports {other}"
+
+
 def test_only_commands_of_logs_and_the_registration_know_recordings() -> None:
     """The registration has the name of their environment, and imports it on its first use."""
     users = {f"fusion_gym.commands.{name}" for name in ("field", "fit", "log_options")}

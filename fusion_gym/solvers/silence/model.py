@@ -8,14 +8,8 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.errors import forbidden
 from fusion_gym.solvers.silence.problem import SilenceProblem
-from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
-from fusion_gym.systems.tobit.centre import Centre, NodeCentre, SequentialCentre
-from fusion_gym.systems.tobit.filters import KalmanFilter
-from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.system import CensoredEstimator, CensoredPlant
+from fusion_gym.systems.solvable import LinearEstimator, LinearProblem
 
 
 @dataclass(frozen=True)
@@ -41,18 +35,17 @@ def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
         ConfigurationError: a task whose centre does not predict with the plant's matrix in silence,
             or weights that are not all above 0.
     """
-    dynamics, sensors = _parts(task)
-    transition, process = dynamics.transition[..., 0], dynamics.process_covariance[..., 0]
-    size = dynamics.size
+    problem = _problem(task)
+    transition, size = problem.transition, len(problem.transition)
     weight = validation.positive("weights", np.ones(size) if weights is None else weights, (size,))
-    matrix, sensed = sensors.stacked_matrix[..., 0], sensors.noise_covariance[..., 0]
-    covariance, correction = _update(dynamics.initial_covariance[..., 0], matrix, sensed)
+    measured = problem.measurement_matrix, problem.noise_covariance
+    covariance, correction = _update(problem.initial_covariance, *measured)
     # The centre starts without the first measurement, but a policy may know it.
     before = transition @ correction @ transition.T
     noise, floor = np.empty((task.horizon, size, size)), 0.0
     for time in range(task.horizon):
-        prior = transition @ covariance @ transition.T + process
-        covariance, noise[time] = _update(prior, matrix, sensed)
+        prior = transition @ covariance @ transition.T + problem.process_covariance
+        covariance, noise[time] = _update(prior, *measured)
         floor += float(weight @ np.diagonal(covariance)) / task.horizon
     noise[0] += before
     return SilenceModel(SilenceProblem.create(transition, weight, noise, 1.0), floor, task.sensors)
@@ -68,36 +61,16 @@ def _update(prior: Array, matrix: Array, noise: Array) -> tuple[Array, Array]:
     return 0.5 * (posterior + posterior.T), 0.5 * (correction + correction.T)
 
 
-def _parts(task: Task) -> tuple[LinearPlant, CensoredSensors]:
-    """Return the task's plant and sensors, if the bound applies to them."""
+def _problem(task: Task) -> LinearProblem:
+    """Return the task's plant and measurements, if the bound applies to them."""
     plant, estimator = task.plant, task.estimator
-    if type(plant) is not CensoredPlant or not isinstance(estimator, CensoredEstimator):
+    problem = None
+    if isinstance(estimator, LinearEstimator):
+        problem = estimator.linear_problem(plant, "for the bound")
+    if problem is None:
         raise validation.ConfigurationError(
             f"plant = {type(plant).__name__} is not allowed for the bound: the centre must "
             "estimate a linear plant from all measurements, as in TobitOscillator and the biased "
             "systems"
         )
-    if estimator.model is not plant.dynamics:
-        reason = "the filters must predict with the plant's own matrix"
-        raise forbidden("bias_aware", False, reason, "for the bound")
-    plant.nature.refuse("for the bound")
-    for part in (plant.dynamics, plant.sensors):
-        part.refuse_schedule("for the bound")
-    if not _predicts(estimator.centre):
-        raise validation.ConfigurationError(
-            "filter is not allowed for the bound: in silence the centre must predict, so neither "
-            "hold the last value (filter='paper' with silent='hold') nor use the information of "
-            "silence (filter='stochastic')"
-        )
-    return plant.dynamics, plant.sensors
-
-
-def _predicts(centre: Centre) -> bool:
-    """Return whether the centre only predicts, by A x̂, in a step without deliveries."""
-    if isinstance(centre, SequentialCentre):
-        return True
-    if not isinstance(centre, NodeCentre):
-        return False
-    if isinstance(centre.filter, BoundTobitFilter):
-        return not centre.filter.hold
-    return isinstance(centre.filter, KalmanFilter) and centre.filter.silence is None
+    return problem

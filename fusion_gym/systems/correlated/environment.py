@@ -167,13 +167,7 @@ def _plant_and_sensors(
     """
     plant, _ = _plant(options)
     moved, deviation = _plant(before)
-    return plant, CorrelatedSensors.create(
-        options.measurement_matrices,
-        options.measurement_variance,
-        options.noise_coupling,
-        deviation,
-        moved,
-    )
+    return plant, CorrelatedSensors.create(options, deviation, moved)
 
 
 def _plant(options: CorrelatedTrackingOptions) -> tuple[LinearPlant, Array]:

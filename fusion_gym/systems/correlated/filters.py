@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -42,20 +42,14 @@ class CorrelatedSensors(Sensors):
 
     @classmethod
     def create(
-        cls,
-        measurement_matrices: ArrayLike,
-        measurement_variance: ArrayLike,
-        noise_coupling: ArrayLike,
-        process_deviation: Array,
-        plant: LinearPlant,
+        cls, options: Any, process_deviation: Array, plant: LinearPlant
     ) -> CorrelatedSensors:
-        """Return sensors from arrays without a batch axis.
+        """Return the sensors of an environment's options.
 
         Args:
-            measurement_matrices: H (sensors, m, n).
-            measurement_variance: variances of η (sensors, m), or one number for all or for each
-                sensor.
-            noise_coupling: β (sensors, m, r), or one number for all or for each sensor.
+            options: arrays without a batch axis: ``measurement_matrices`` H (sensors, m, n),
+                ``measurement_variance``, variances of η (sensors, m), and ``noise_coupling`` β
+                (sensors, m, r); of the last two also one number for all or for each sensor.
             process_deviation: Q^½ (r,).
             plant: the plant, whose ``process_factor`` is Γ Q^½.
 
@@ -63,12 +57,12 @@ class CorrelatedSensors(Sensors):
             ConfigurationError: a wrong shape, a variance <= 0, or an entry that is not finite.
         """
         shape = (None, None, plant.size)
-        matrix = validation.array("measurement_matrices", measurement_matrices, shape)
+        matrix = validation.array("measurement_matrices", options.measurement_matrices, shape)
         sensors, size, _ = matrix.shape
-        given = validation.by_row(measurement_variance, (sensors, size))
+        given = validation.by_row(options.measurement_variance, (sensors, size))
         variance = validation.positive("measurement_variance", given, (sensors, size))
         shares = (sensors, size, len(process_deviation))
-        given = validation.by_row(noise_coupling, shares)
+        given = validation.by_row(options.noise_coupling, shares)
         beta = validation.spread("noise_coupling", given, shares)
         coupling = (beta * process_deviation)[..., None]
         shared = linalg.matmul(coupling[:, None], linalg.transpose(coupling)[None])

@@ -29,6 +29,7 @@ from fusion_gym.systems.correlated.filters import (
 )
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
+from fusion_gym.systems.solvable import BoundingEstimator
 from fusion_gym.validation import refusal
 
 _ALL = slice(None)
@@ -138,7 +139,9 @@ SIGNALS = (
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
+class CorrelatedTrackingEstimator(
+    ScaledEstimator[CorrelatedTrackingEstimate], BoundingEstimator[CorrelatedTrackingEstimate]
+):
     """Robust local filters, and a fusion rule without feedback.
 
     ``joint`` tracks the covariances of the errors, of which the actual ones are the share
@@ -187,14 +190,12 @@ class CorrelatedTrackingEstimator(ScaledEstimator[CorrelatedTrackingEstimate]):
             knowledge.age_block(nodes),
             self.deviation_block(
                 "local_log_deviation",
-                "logarithm of the node's predicted over the open-loop deviation",
-                lambda s: knowledge.log_deviation(s.prior_covariance[1:], self.reference),
+                "the node's predicted",
+                lambda s: s.prior_covariance[1:],
                 nodes,
             ),
             self.deviation_block(
-                "log_deviation",
-                "logarithm of the fused predicted over the open-loop deviation",
-                lambda s: knowledge.log_deviation(s.prior_covariance[0], self.reference),
+                "log_deviation", "the fused predicted", lambda s: s.prior_covariance[0]
             ),
             self.estimate_block(
                 "fused prediction over the state's root mean square", lambda s: s.prior_mean[0]

@@ -20,10 +20,16 @@ from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralEstimator
-from fusion_gym.systems.markov_jump.centralised import CentralisedLinearFilter, InteractingModels
-from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
-from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
+from fusion_gym.systems.markov_jump.centralised import (
+    CentralisedLinearFilter,
+    InteractingModels,
+    MarkovJumpCentralEstimator,
+)
+from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    AugmentedModel,
+    LagRecursion,
+    LocalFilters,
+)
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 from fusion_gym.systems.markov_jump.system import FadingPlant, MarkovJumpEstimator
 from fusion_gym.systems.parts import numbered_states
@@ -118,16 +124,8 @@ class MarkovJumpTrackingOptions(PaperOptions):
 def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
     """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
-    chain = options.mode_transition, options.initial_probabilities
-    start = options.initial_mean, options.initial_covariance
-    dynamics = MarkovJumpPlant.create(
-        options.transitions, options.process_gains, options.process_covariance, *chain, *start
-    )
-    fading = options.fading_values, options.fading_probabilities
-    noise = options.noise_coupling, options.measurement_variance
-    sensors = FadingSensors.create(
-        options.measurement_matrices, options.sampling_periods, *fading, *noise, dynamics
-    )
+    dynamics = MarkovJumpPlant.create(options)
+    sensors = FadingSensors.create(options, dynamics)
     weights = options.own_weights(dynamics.size)
     nature = Nature.create(options, (*dynamics.unmoved, "true_threshold_shift"))
     nature.check_growth(dynamics.true_radius, horizon)

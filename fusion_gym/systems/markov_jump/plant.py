@@ -7,6 +7,7 @@ systems with correlated noises and fading measurements).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -75,51 +76,38 @@ class MarkovJumpPlant:
     initial_factor: Array
 
     @classmethod
-    def create(
-        cls,
-        transitions: ArrayLike,
-        process_gains: ArrayLike,
-        process_covariance: ArrayLike,
-        mode_transition: ArrayLike,
-        initial_probabilities: ArrayLike,
-        initial_mean: ArrayLike,
-        initial_covariance: ArrayLike,
-    ) -> MarkovJumpPlant:
-        """Return a plant from arrays without a batch axis.
+    def create(cls, options: Any) -> MarkovJumpPlant:
+        """Return the plant of an environment's options.
 
         Args:
-            transitions: Φ (modes, n, n).
-            process_gains: Γ (modes, n, r).
-            process_covariance: Q (r, r), or a number for r = 1.
-            mode_transition: p (modes, modes).
-            initial_probabilities: (modes,).
-            initial_mean: μ₀ (n,).
-            initial_covariance: P₀ (n, n).
+            options: arrays without a batch axis: ``transitions`` Φ (modes, n, n), ``process_gains``
+                Γ (modes, n, r), ``process_covariance`` Q (r, r) or one number, ``mode_transition``
+                p (modes, modes), ``initial_probabilities`` (modes,), ``initial_mean`` μ₀ (n,) and
+                ``initial_covariance`` P₀ (n, n).
 
         Raises:
             ConfigurationError: a wrong shape, an entry that is not finite, probabilities of another
                 sum, a covariance that is not positive semi-definite, or a plant that is not
                 mean-square stable.
         """
-        matrices = validation.array("transitions", transitions, (None, None, None))
+        matrices = validation.array("transitions", options.transitions, (None, None, None))
         modes, size, _ = matrices.shape
-        matrices = validation.array("transitions", transitions, (modes, size, size))
-        gains = validation.array("process_gains", process_gains, (modes, size, None))
+        matrices = validation.array("transitions", matrices, (modes, size, size))
+        gains = validation.array("process_gains", options.process_gains, (modes, size, None))
         noises = gains.shape[2]
-        values: ArrayLike = process_covariance
-        if isinstance(process_covariance, (int, float, np.number)):
-            values = validation.number("process_covariance", process_covariance) * np.eye(noises)
+        values = options.process_covariance
+        if isinstance(values, (int, float, np.number)):
+            values = validation.number("process_covariance", values) * np.eye(noises)
         noise = validation.covariance("process_covariance", values, noises)
+        chain, first = options.mode_transition, options.initial_probabilities
         plant = cls(
             transition=np.ascontiguousarray(matrices.transpose(1, 2, 0)),
             process_gain=np.ascontiguousarray(gains.transpose(1, 2, 0)),
             noise_covariance=noise,
             noise_factor=(covariance_factor(noise) if noise.any() else noise)[..., None],
-            mode_transition=probabilities("mode_transition", mode_transition, (modes, modes)),
-            initial_probabilities=probabilities(
-                "initial_probabilities", initial_probabilities, (modes,)
-            ),
-            **initial_law(initial_mean, initial_covariance, size),
+            mode_transition=probabilities("mode_transition", chain, (modes, modes)),
+            initial_probabilities=probabilities("initial_probabilities", first, (modes,)),
+            **initial_law(options.initial_mean, options.initial_covariance, size),
         )
         radius = plant.second_moment_radius()
         if radius >= 1.0 - 1e-9:
@@ -228,25 +216,14 @@ class FadingSensors:
     deviation: Array
 
     @classmethod
-    def create(
-        cls,
-        measurement_matrices: ArrayLike,
-        sampling_periods: ArrayLike,
-        fading_values: ArrayLike,
-        fading_probabilities: ArrayLike,
-        noise_coupling: ArrayLike,
-        measurement_variance: ArrayLike,
-        plant: MarkovJumpPlant,
-    ) -> FadingSensors:
-        """Return sensors from arrays without a batch axis.
+    def create(cls, options: Any, plant: MarkovJumpPlant) -> FadingSensors:
+        """Return the sensors of an environment's options.
 
         Args:
-            measurement_matrices: H (sensors, modes, n).
-            sampling_periods: one number for all sensors or one for each.
-            fading_values: (sensors, values).
-            fading_probabilities: (sensors, values).
-            noise_coupling: α (sensors,) or (sensors, r).
-            measurement_variance: one number for all sensors or one for each.
+            options: arrays without a batch axis: ``measurement_matrices`` H (sensors, modes, n),
+                ``fading_values`` and ``fading_probabilities`` (sensors, values), ``noise_coupling``
+                α (sensors,) or (sensors, r); ``sampling_periods`` and ``measurement_variance``, one
+                number for all sensors or one for each.
             plant: the plant.
 
         Raises:
@@ -254,28 +231,26 @@ class FadingSensors:
                 outside [0, 1], probabilities of another sum, a variance <= 0, or an entry that is
                 not finite.
         """
-        matrix = validation.array(
-            "measurement_matrices", measurement_matrices, (None, plant.modes, plant.size)
-        )
-        sensors = len(matrix)
-        period = validation.spread("sampling_periods", sampling_periods, (sensors,))
+        shape = None, plant.modes, plant.size
+        matrix = validation.array("measurement_matrices", options.measurement_matrices, shape)
+        sensors, given = len(matrix), options.sampling_periods
+        period = validation.spread("sampling_periods", given, (sensors,))
         if np.any(period < 1.0) or np.any(period != np.round(period)):
             reason = "each must be a whole number >= 1"
-            raise forbidden("sampling_periods", sampling_periods, reason)
-        values = validation.array("fading_values", fading_values, (sensors, None))
+            raise forbidden("sampling_periods", given, reason)
+        values = validation.array("fading_values", options.fading_values, (sensors, None))
         if np.any(values < 0.0) or np.any(values > 1.0):
             raise forbidden("fading_values", values, "each must be from 0 to 1")
-        variance = validation.positive("measurement_variance", measurement_variance, (sensors,))
-        shape = (sensors, len(plant.noise_covariance))
-        coupling = validation.by_row(noise_coupling, shape)
+        share, given = options.fading_probabilities, options.measurement_variance
+        variance = validation.positive("measurement_variance", given, (sensors,))
+        couplings = sensors, len(plant.noise_covariance)
+        coupling = validation.by_row(options.noise_coupling, couplings)
         return cls(
             measurement_matrix=np.ascontiguousarray(matrix.transpose(0, 2, 1)),
             period=period.astype(np.int64)[:, None],
             fading_values=values,
-            fading_probabilities=probabilities(
-                "fading_probabilities", fading_probabilities, values.shape
-            ),
-            noise_coupling=validation.spread("noise_coupling", coupling, shape)[..., None],
+            fading_probabilities=probabilities("fading_probabilities", share, values.shape),
+            noise_coupling=validation.spread("noise_coupling", coupling, couplings)[..., None],
             variance=variance[:, None],
             deviation=np.sqrt(variance)[:, None],
         )

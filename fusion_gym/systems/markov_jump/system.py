@@ -29,9 +29,11 @@ from fusion_gym.core.knowledge import (
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.namespace import namespace, take
-from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
+    JointPrediction,
+    LagCovariances,
+    LagRecursion,
     LocalFilters,
     Times,
 )
@@ -231,16 +233,9 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
                 constants={"open-loop trace": self.reference.sum()},
             ),
             self.deviation_block(
-                "copy_log_deviation",
-                "logarithm of the copy's predicted over the open-loop deviation",
-                self._copy_log_deviation,
-                nodes,
+                "copy_log_deviation", "the copy's predicted", self._copy_covariance, nodes
             ),
-            self.deviation_block(
-                "log_deviation",
-                "logarithm of the silent fused over the open-loop deviation",
-                lambda s: log_deviation(s.prior_covariance, self.reference),
-            ),
+            self.deviation_block("log_deviation", "the silent fused", lambda s: s.prior_covariance),
             self.estimate_block(
                 "fused estimate without a transmission over the root mean square",
                 lambda s: s.prior_mean,
@@ -309,14 +304,9 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         mean, noise_mean, innovation = self.filters.update(
             state.node_mean, measurement[:, 0], sampled, place
         )
+        seen = namespace(sampled, measurement).where(sampled[:, None], measurement, np.nan)
         return replace(
-            state,
-            measurement=namespace(sampled, measurement).where(
-                sampled[:, None], measurement, np.nan
-            ),
-            innovation=innovation,
-            node_mean=mean,
-            node_noise=noise_mean,
+            state, measurement=seen, innovation=innovation, node_mean=mean, node_noise=noise_mean
         )
 
     def update(self, state: MarkovJumpEstimate, reception: Reception) -> MarkovJumpEstimate:
@@ -328,12 +318,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         grant, xp = arrived[:, None], namespace(arrived)
         copy_mean = xp.where(grant, state.node_mean, state.copy_mean)
         fused = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(arrived))
-        return replace(
-            state,
+        return state.after(
+            arrived,
+            self._collapse(state.node_mean),
             copy_mean=copy_mean,
             copy_noise=xp.where(grant, state.node_noise, state.copy_noise),
-            held=xp.where(grant, self._collapse(state.node_mean), state.held),
-            age=xp.where(arrived, 0.0, state.age),
             mean=fused.mean,
             covariance=fused.covariance,
         )
@@ -390,10 +379,9 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         trace = take(self.recursion.local_trace, self.filters.at(state.time))
         return log_deviation(trace[:, None, None], self.reference.sum(keepdims=True))[:, 0]
 
-    def _copy_log_deviation(self, state: MarkovJumpEstimate) -> Array:
+    def _copy_covariance(self, state: MarkovJumpEstimate) -> Array:
         prediction, nodes = sensed(state.prediction), np.arange(self.model.sensors.count)
-        covariance = prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
-        return log_deviation(covariance, self.reference)
+        return prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:
         """Return the predicted deviations (l, n, N) of node minus copy, above zero."""

@@ -159,7 +159,7 @@ def _silence(options: RemoteEstimationOptions, sensors: int) -> Silence | None:
     """Return the silence that the estimator uses."""
     validation.choice("filter", options.filter, _FILTERS)
     if options.filter == "truncated":
-        return Silence.create(options.trigger, options.trigger_threshold, sensors, 1)
+        return Silence.create(options, sensors, 1)
     for name in ("trigger", "trigger_threshold"):
         if getattr(options, name) is not None:
             raise validation.refusal(name, getattr(options, name), "left out", _WHERE)

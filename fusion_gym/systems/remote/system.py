@@ -13,10 +13,11 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
-from fusion_gym.core.plant import AS_ASSUMED, Nature, Plant, true_motion, true_noise
+from fusion_gym.core.plant import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.parts import RANGE, Deliveries
 from fusion_gym.systems.silence import Silence
+from fusion_gym.systems.solvable import IndependentSources
 
 _FLOOR = 1e-12  # variance after a delivery, in process variances: zero could not be inverted
 
@@ -33,18 +34,13 @@ class SourceTruth:
 
 
 @dataclass(frozen=True)
-class ScalarSources(Plant[SourceTruth]):
+class ScalarSources(IndependentSources[SourceTruth]):
     """n independent sources x(t+1) = a x(t) + w(t), w ~ N(0, σ²), measured without noise.
 
-    Shapes: ``coefficient`` a, ``deviation`` σ, ``initial_deviation`` of x(0): (n,). Where the truth
-    departs by ``nature``, a source moves by c a, because I + c (a - I) would not change a random
-    walk.
+    Where the truth departs by ``nature``, a source moves by c a, because I + c (a - I) would not
+    change a random walk.
     """
 
-    state_names: tuple[str, ...]
-    coefficient: Array
-    deviation: Array
-    initial_deviation: Array
     nature: Nature = AS_ASSUMED
     traceable = True
 

@@ -18,6 +18,7 @@ from fusion_gym.core.plant import Nature, true_motion, true_noise
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.parts import RANGE, Deliveries, NormalPlant, Truth, numbered_states
+from fusion_gym.systems.solvable import AgedSources
 
 KEYS = ("transition", "process_covariance", "measurement_matrix", "measurement_covariance")
 _FLOOR = 1e-12  # of a deviation, in process deviations: zero could not divide
@@ -103,7 +104,7 @@ def _padded(blocks: Sequence[NDArray[Any]]) -> Array:
 
 
 @dataclass(frozen=True)
-class VectorSources(NormalPlant):
+class VectorSources(NormalPlant, AgedSources[Truth]):
     """l independent sources with s states and m channels at most; x(0) ~ N(0, P̄).
 
     Shapes: ``transition`` (l, s, s, 1), ``process_factor`` (l, s, s, 1), ``measurement_matrix``
@@ -191,8 +192,7 @@ class VectorSources(NormalPlant):
     def blocks(self, values: Array) -> Array:
         """Return values (n, N) of the states by source (l, s, N)."""
         xp = namespace(values)
-        result: Array = xp.concatenate((values, xp.zeros_like(values[:1])))[self.places]
-        return result
+        return xp.concatenate((values, xp.zeros_like(values[:1])))[self.places]
 
     def flat(self, values: Array) -> Array:
         """Return values (l, s, N) as values (n, N) of the states."""
@@ -205,14 +205,26 @@ class VectorSources(NormalPlant):
         same = np.eye(count, dtype=np.bool_)[:, None, :, None, None]
         spread = namespace(blocks).where(same, blocks[:, :, None], 0.0)
         present = np.flatnonzero(self.places < len(self.state_names))
-        square: Array = spread.reshape(count * size, count * size, runs)
-        return square[present][:, present]
+        return spread.reshape(count * size, count * size, runs)[present][:, present]
 
     def predict_covariance(self, covariance: Array) -> Array:
         """Return A P Aᵀ + W of covariances P (l, s, s, N)."""
         moved = linalg.matmul(self.transition, covariance)
         moved = linalg.matmul(moved, linalg.transpose(self.transition))
         return moved + linalg.gram(self.process_factor)
+
+    def age_costs(self, weights: Array, ages: int) -> Array:
+        """Return the weighted traces (ages, l) of the sources' covariances at the ages 0, 1, …."""
+        own, covariance, costs = self.blocks(weights)[..., 0], self.posterior, []
+        for _ in range(ages):
+            costs.append((own * linalg.diagonal(covariance)[..., 0]).sum(1))
+            covariance = self.predict_covariance(covariance)
+        return np.array(costs)
+
+    @property
+    def radii(self) -> Array:
+        """Spectral radius (l,) of each source."""
+        return np.array([np.abs(np.linalg.eigvals(a)).max() for a in self.transition[..., 0]])
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without a delivery."""
@@ -334,10 +346,9 @@ class VectorEstimator(Estimator[VectorEstimate]):
         """Replace the centre's prediction by the estimates that arrive."""
         arrived, xp = reception.arrived, namespace(reception.arrived, state.prior)
         grant = arrived[:, None]
-        return replace(
-            state,
-            held=xp.where(grant, state.node_mean, state.held),
-            age=xp.where(arrived, 0.0, state.age),
+        return state.after(
+            arrived,
+            state.node_mean,
             mean=xp.where(grant, state.node_mean, state.prior),
             blocks=xp.where(grant[:, None], self.model.posterior, state.prior_blocks),
         )
@@ -353,8 +364,7 @@ class VectorEstimator(Estimator[VectorEstimate]):
             least = (_FLOOR * linalg.diagonal(linalg.gram(self.model.process_factor))) + _FLOOR**2
             variance = linalg.diagonal(state.prior_blocks - self.model.posterior)
             xp = namespace(variance)
-            root: Array = xp.sqrt(xp.maximum(variance, least))
-            return root
+            return xp.sqrt(xp.maximum(variance, least))
 
         return {
             **super().read(state, failure),

@@ -24,13 +24,13 @@ from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states
-from fusion_gym.systems.tobit import options as tobit_options
+from fusion_gym.systems.tobit import system
+from fusion_gym.systems.tobit.filters import TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
-_FILTERS = {"paper": tobit_options.at_the_nodes(TobitKalmanFilter), **tobit_options.FILTERS}
+_FILTERS = {"paper": system.at_the_nodes(TobitKalmanFilter), **system.FILTERS}
 _PERIOD = 0.1  # seconds between two samples of the tracking example
 # Observed variances are relative to those after so many silent steps: over a whole episode the
 # target, a double integrator of a random walk, drifts thousands of times as far as it is known.
@@ -38,7 +38,7 @@ _REFERENCE_HORIZON = 10
 
 
 @dataclass(frozen=True)
-class BiasedOscillatorOptions(tobit_options.FeedbackOptions):
+class BiasedOscillatorOptions(system.FeedbackOptions):
     """An oscillator driven by a stochastic bias, observed by two sensors that saturate at ±5.
 
     The bias drives the state and no sensor measures it. Each sensor measures one component of the
@@ -60,7 +60,7 @@ class BiasedOscillatorOptions(tobit_options.FeedbackOptions):
         (2, 'single', 100)
     """
 
-    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
     transition: ArrayLike = ((_COS, -_SIN), (_SIN, _COS))
     """A of equation (1), (n, n)."""
     process_covariance: ArrayLike = ((0.0025, 0.0), (0.0, 0.0025))
@@ -160,7 +160,7 @@ def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
     )
     biases = plant.size - states
     own = ("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))
-    return tobit_options.feedback_scenario(
+    return system.feedback_scenario(
         options,
         _FILTERS,
         plant,

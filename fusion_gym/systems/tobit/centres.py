@@ -1,32 +1,371 @@
-"""Centres of linear systems: all deliveries together, a hold of values, silence as information."""
+"""Nodes and fusion centres: from prediction and deliveries to the fused estimate."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, cast
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import linalg
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
+from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.silence import Silence
-from fusion_gym.systems.tobit.centre import (
-    Centre,
-    CentrePrediction,
-    FederatedCentre,
-    Gaussian,
-    Packets,
+from fusion_gym.systems.tobit.filters import (
+    AssumedDensityFilter,
+    Expectation,
+    KalmanFilter,
+    NodeFilter,
+    Outcomes,
+    joint_update,
 )
-from fusion_gym.systems.tobit.filters import KalmanFilter, joint_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
+Gaussian = tuple[Array, Array]  # mean (…, n, N) and covariance (…, n, n, N)
+Packets = NDArray[np.bool_]
 _MOST_CHANNELS = 100  # whose joint covariance is solved in every step
 _ROUNDS = 2  # a third changes errors by less than a thousandth
 _LEAST_SHARE = 1e-9  # of a variance; the rest of the difference is rounding
+
+
+class Prediction(NamedTuple):
+    """The prediction of centre and nodes before a transmission.
+
+    ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
+    (n, n, N) of the covariance without a transmission, the centre's ``prior``, and, where nodes
+    have covariances of their own, their ``outcomes`` z of x = x̂ + G z. A centre that uses held
+    values has them as ``held``, a hold its ``moment``; ``possible`` (sensors, N) are the sensors
+    that the network would have granted, ``None`` for all.
+    """
+
+    expectation: Expectation
+    deviation: Array
+    root: Array
+    prior: Gaussian
+    outcomes: Outcomes | None = None
+    held: Any = None
+    moment: Any = None
+    possible: Any = None
+
+
+class Centre(Protocol):
+    """The interface of nodes and centre.
+
+    Attributes:
+        separable: Whether :meth:`single` is available, and faster than one update after another.
+        reads_silence: Whether a step without a delivery is information.
+        traceable: Whether JAX traces the methods.
+        predicts: Whether a step without a delivery only predicts, by A x̂.
+    """
+
+    filter: Any
+    separable: ClassVar[bool] = False
+    reads_silence: ClassVar[bool] = False
+    traceable: ClassVar[bool] = True
+    predicts: ClassVar[bool] = False
+
+    @property
+    def sensors(self) -> CensoredSensors:
+        """The sensors."""
+        return self.filter.sensors
+
+    def at(self, step: Array) -> Self:
+        """Return the centre with the matrices of its sensors at steps (N,)."""
+        sensors = self.sensors.at(step)
+        if sensors is self.sensors:
+            return self
+        return replace(cast(Any, self), filter=replace(self.filter, sensors=sensors))
+
+    @property
+    def predictable(self) -> bool:
+        """Whether the covariances depend on the deliveries only."""
+        return False
+
+    def advance(self, model: LinearPlant, state: Any) -> Prediction:
+        """Return the prediction one step after a state's delivery."""
+        prior = model.predict(state.mean, state.covariance)
+        return self.predict(prior, state.held, state.time + 1.0)
+
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
+        """Return the expectations under the centre's prior (n, N), (n, n, N)."""
+
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
+        """Return mean (n, N) and covariance (n, n, N) after the grants (sensors, N)."""
+
+    def local_means(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
+        """Return the nodes' means (sensors, n, N) before feedback; without nodes, the centre's."""
+        own = self.update(prediction, measurement, granted)[0]
+        return np.broadcast_to(own, (len(granted), *own.shape))
+
+    def single(self, prediction: Prediction, measurement: Array) -> Gaussian:
+        """Return means (sensors, n, N) and covariances (sensors, n, n, N) after single grants."""
+        raise RuntimeError(f"{type(self).__name__} is not separable")
+
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
+        """Return a silent step's weighted fused trace (N,), and its reductions (sensors, N).
+
+        A packet holds the expected measurement.
+        """
+        count, runs = self.sensors.count, prediction.root.shape[-1]
+
+        def trace(granted: Packets) -> Array:
+            packets = np.broadcast_to(granted[:, None], (count, runs))
+            posterior = self.update(prediction, prediction.expectation.value, packets)
+            return linalg.weighted_trace(posterior[1], weights)
+
+        silent = trace(np.zeros(count, dtype=np.bool_))
+        return silent, silent - np.stack([trace(own) for own in np.eye(count, dtype=np.bool_)])
+
+
+def information_shares(share: ArrayLike | None, sensors: int) -> Array:
+    """Return the shares (sensors, 1) of the prediction that the nodes get.
+
+    Args:
+        share: w_m > 0 with sum 1 (sensors,), or None for equal shares.
+        sensors: number of sensors.
+
+    Raises:
+        ConfigurationError: a wrong shape, an entry <= 0, or another sum.
+    """
+    if share is None:
+        return np.full((sensors, 1), 1.0 / sensors)
+    weights = validation.array("information_shares", share, (sensors,))
+    if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
+        reason = f"they must be > 0 with sum 1 (their sum is {weights.sum():.6g})"
+        raise forbidden("information_shares", weights, reason)
+    return weights[:, None]
+
+
+@dataclass(frozen=True)
+class NodeCentre(Centre):
+    """A centre with a node filter for each sensor, with feedback of its prediction.
+
+    With shares w_m of sum 1, ``share`` (sensors, 1), node m gets the prediction with its covariance
+    multiplied by 1/w_m. This is the paper's feedback (51) and local prediction (29) in one: it
+    inflates both the fused covariance and the process covariance. Both inflations are necessary so
+    that the sum of the nodes' information counts nothing twice.
+
+    With shares of 1 every node gets the prediction unchanged. Only the fusion rule then avoids
+    counting the common prior several times; it must be a form of covariance intersection. Two nodes
+    with a common prior and independent measurements are the structure for which the inverse form
+    was derived, so "ici" keeps its bound here. With a single delivery every form returns the node
+    that received it.
+
+    Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (27).
+    """
+
+    filter: NodeFilter
+    share: Array
+
+    @property
+    def predicts(self) -> bool:  # type: ignore[override]
+        """See :class:`Centre`."""
+        return self.filter.predicts
+
+    @property
+    def predictable(self) -> bool:
+        """See :class:`Centre`; true for Kalman filters of uncensored sensors."""
+        return type(self.filter) is KalmanFilter and self.sensors.unlimited
+
+
+@dataclass(frozen=True)
+class FeedbackCentre(NodeCentre):
+    """A node filter for each sensor, fusion, and feedback of the result to the nodes.
+
+    Nodes and fusion work on z of x = x̂ + G z with G Gᵀ the covariance of the prediction, so that
+    all inverted covariances are regular.
+
+    Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
+    equations (18)-(27).
+    """
+
+    fusion: FusionRule
+
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
+        """See :class:`Centre`."""
+        expectation = self.filter.expect(prior[0])
+        root = linalg.root(self.sensors.regular(prior[1]))
+        observed = linalg.matmul(self.sensors.measurement_matrix, root)
+        deviation = _deviation(self.sensors, expectation, linalg.total(observed * observed))
+        share = self.share[:, None, None]
+        inflated = observed / namespace(share).sqrt(share)
+        outcomes = self.filter.outcomes(inflated, expectation, held, time)
+        return Prediction(expectation, deviation, root, prior, outcomes)
+
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
+        """See :class:`Centre`; each node uses its planned outcome of a grant or of silence."""
+        outcomes, root, share = _outcomes(prediction), prediction.root, self.share[:, None]
+        both = outcomes.delivered_covariance, outcomes.silent_covariance
+        own = namespace(granted).where(granted[:, None, None], *both)
+        local = self._shift(prediction, measurement, granted)
+        fused = self.fusion.fuse(local, own / share[:, None], basis=root)
+        mean = prediction.prior[0] + linalg.matvec(root, fused.mean)
+        return mean, linalg.congruence(root, fused.covariance)
+
+    def local_means(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
+        """See :class:`Centre`."""
+        local = self._shift(prediction, measurement, granted)
+        return prediction.prior[0] + linalg.matvec(prediction.root, local)
+
+    def _shift(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
+        """Return the nodes' means (sensors, n, N) of z."""
+        outcomes = _outcomes(prediction)
+        innovation = measurement - prediction.expectation.value
+        delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
+        local = namespace(granted).where(granted[:, None], delivered, outcomes.silent_mean)
+        share = self.share[:, None]
+        return local / namespace(share).sqrt(share)
+
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
+        """See :class:`Centre`; a filter that minimises a bound uses the bound."""
+        outcomes, root = _outcomes(prediction), prediction.root
+        share = self.share[:, None, None]
+        covariances = outcomes.silent_covariance / share, outcomes.delivered_covariance / share
+        silent, single = (
+            linalg.weighted_trace(linalg.congruence(root, fused), weights)
+            for fused in self.fusion.fuse_single(*covariances, basis=root)
+        )
+        return silent, silent - single
+
+
+@dataclass(frozen=True)
+class FederatedCentre(NodeCentre):
+    """Nodes with Kalman filters whose information adds up, computed at the centre.
+
+    Nodes that share the prediction P in shares w_m of sum 1 have the information Σ (w_m P⁻¹ + Cᵀ
+    N⁻¹ C) together. This equals the centre's own update by one delivered scalar after another,
+    which inverts no covariance. A silent sensor of weight Z acts as an innovation of zero with the
+    noise N + Z⁻¹; a delivery adds the difference N⁻¹ - (N + Z⁻¹)⁻¹ = (N + N Z N)⁻¹.
+
+    Source: tobit_token_bucket, equations (20)-(23), (50), (51); round_robin_tobit, equations
+    (18)-(27).
+    """
+
+    filter: KalmanFilter
+    separable = True
+
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
+        """See :class:`Centre`; ``held`` and ``time`` have no effect."""
+        sensors, weight = self.sensors, self.filter.silence
+        expectation, root = self.filter.expect(prior[0]), linalg.root(prior[1])
+        observed = linalg.matmul(sensors.measurement_matrix, root)
+        deviation = _deviation(sensors, expectation, linalg.total(observed * observed))
+        if weight is not None:
+            # Both sides times √Z, so that weight 0 is no exception.
+            scale = (weight[:, None] / (1.0 + weight[:, None] * sensors.variance)) ** 0.5
+            nothing = 0.0 * expectation.value
+            _, silent = joint_update(_stack(scale[:, :, None] * observed), _stack(nothing))
+            root = linalg.matmul(root, linalg.root(silent))
+        return Prediction(expectation, deviation, root, prior)
+
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
+        """See :class:`Centre`."""
+        mean, covariance = prediction.prior
+        xp, places = namespace(granted), active_rows(granted)
+        silent = covariance if self.filter.silence is None else linalg.gram(prediction.root)
+        if not places.size:
+            return mean, silent
+        matrix, value = self._whitened(prediction, measurement, places)
+        matrix = xp.where(granted[places, None, None], matrix, 0.0)
+        mean, posterior = _shifted(prediction, _stack(matrix), _stack(value))
+        return mean, xp.where(granted.any(0), posterior, silent)
+
+    def local_means(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
+        """See :class:`Centre`."""
+        sensors, expectation = self.sensors, prediction.expectation
+        weighted = expectation.uncensored_probability[:, :, None] * sensors.measurement_matrix
+        cross = linalg.matmul(weighted, prediction.prior[1])
+        total = linalg.matmul(cross, linalg.transpose(weighted))
+        noise = sensors.variance * expectation.truncated_variance
+        total = linalg.add_diagonal(total, self.share[:, None] * noise)
+        innovation = measurement - expectation.value
+        innovation = namespace(innovation).where(granted[:, None], innovation, 0.0)
+        shift = linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
+        return prediction.prior[0] + shift
+
+    def single(self, prediction: Prediction, measurement: Array) -> Gaussian:
+        """See :class:`Centre`."""
+        return _shifted(prediction, *self._whitened(prediction, measurement, slice(None)))
+
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
+        """See :class:`Centre`."""
+        silent = linalg.weighted_trace(linalg.gram(prediction.root), weights)
+        single = self.single(prediction, prediction.expectation.value)[1]
+        return silent, silent - linalg.weighted_trace(single, weights)
+
+    def _whitened(
+        self, prediction: Prediction, measurement: Array, places: Any
+    ) -> tuple[Array, Array]:
+        """Return N^-½ q C G (…, m, n, N) and N^-½ (y - ŷ): deliveries with unit noise."""
+        sensors, expectation, weight = self.sensors, prediction.expectation, self.filter.silence
+        noise = sensors.variance[places] * expectation.truncated_variance[places]
+        innovation = measurement[places] - expectation.value[places]
+        if weight is not None:
+            larger = 1.0 + weight[places, None] * noise
+            noise, innovation = noise * larger, innovation * larger
+        scale = 1.0 / namespace(noise).sqrt(noise)
+        matrix = linalg.matmul(sensors.measurement_matrix[places], prediction.root)
+        scaled = scale * expectation.uncensored_probability[places]
+        return scaled[..., None, :] * matrix, scale * innovation
+
+
+@dataclass(frozen=True)
+class SequentialCentre(Centre):
+    """A centre without nodes, which processes the deliveries one after another."""
+
+    filter: AssumedDensityFilter
+    predicts = True
+
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
+        """See :class:`Centre`; ``held`` and ``time`` have no effect."""
+        root = linalg.root(prior[1])
+        expectation = self.filter.expect(prior[0], root)
+        floor = 1e-3 * self.sensors.variance
+        deviation = namespace(root).sqrt(expectation.noise_variance + floor)
+        return Prediction(expectation, deviation, root, prior)
+
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
+        """See :class:`Centre`."""
+        mean, covariance = prediction.prior
+        mean, root = self.filter.update(mean, prediction.root, measurement, granted)
+        fused = namespace(granted).where(granted.any(0), linalg.gram(root), covariance)
+        return mean, fused
+
+    def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
+        """See :class:`Centre`; the reduction is the expected one."""
+        silent = linalg.weighted_trace(prediction.prior[1], weights)
+        expected = self.filter.expected_covariance(prediction.prior[0], prediction.root)
+        return silent, silent - linalg.weighted_trace(expected, weights)
+
+
+def _deviation(sensors: CensoredSensors, expectation: Expectation, spread: Array) -> Array:
+    """Return the innovation's deviation from the variances ``spread`` of C x, all (l, m, N)."""
+    q = expectation.uncensored_probability
+    variance = q * q * spread + expectation.noise_variance + 1e-3 * sensors.variance
+    return namespace(variance).sqrt(variance)
+
+
+def _stack(values: Array) -> Array:
+    """Return the channels of all sensors (sensors · m, …) of (sensors, m, …)."""
+    return values.reshape(-1, *values.shape[2:])
+
+
+def _shifted(prediction: Prediction, matrix: Array, value: Array) -> Gaussian:
+    """Return mean and covariance of x = x̂ + G z after :func:`joint_update` of z."""
+    shift, covariance = joint_update(matrix, value)
+    root = prediction.root
+    return prediction.prior[0] + linalg.matvec(root, shift), linalg.congruence(root, covariance)
+
+
+def _outcomes(prediction: Prediction) -> Outcomes:
+    if prediction.outcomes is None:
+        raise RuntimeError("the prediction has no outcomes: another centre made it")
+    return prediction.outcomes
 
 
 @dataclass(frozen=True)
@@ -56,11 +395,9 @@ class JointCentre(FederatedCentre):
     Source: B. D. O. Anderson and J. B. Moore, "Optimal Filtering", 1979, chapter 3.
     """
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
-        mean, covariance = prior
+        mean, covariance = prediction.prior
         xp, sensors, runs = namespace(granted), self.sensors, granted.shape[-1]
         every = xp.repeat(granted, sensors.size, axis=0)
         channels = active_rows(every)
@@ -150,40 +487,38 @@ class HoldCentre(Centre):
         both = np.concatenate([still, matrix])[..., None]
         return motion[..., None], linalg.congruence(both, self.plant.process_covariance)
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; the prediction of the start, when every value is delivered."""
+        mean, covariance = prior
         n, channels = self.inverse.shape[:2]
         moment = np.zeros((n + channels, n + channels, mean.shape[-1]))
         moment[:n, :n] = covariance + linalg.outer(mean, mean)
-        return self._predict((mean, covariance), held, moment)
+        return self._predict(prior, held, moment)
 
-    def advance(self, model: LinearPlant, state: Any) -> tuple[Gaussian, CentrePrediction]:
+    def advance(self, model: LinearPlant, state: Any) -> Prediction:
         """See :class:`Centre`; the estimate stays."""
         before = state.prediction
         if before is None:
             runs, plant = state.mean.shape[-1], self.plant
             first = (plant.initial_mean, plant.initial_covariance)
             mean, covariance = (np.repeat(values, runs, axis=-1) for values in first)
-            before = self.predict(mean, covariance, state.held, state.time)
+            before = self.predict((mean, covariance), state.held, state.time)
         transition, noise = self.motion
         moment = self._delivered(before.moment, state.age == 0.0)
         moment = linalg.congruence(transition, moment) + noise
-        prior = state.mean, self._covariance(moment)
-        return prior, self._predict(prior, state.held, moment)
+        return self._predict((state.mean, self._covariance(moment)), state.held, moment)
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
         held = np.where(granted[:, None], measurement, prediction.held)
         mean = linalg.matvec(self.inverse, held.reshape(-1, held.shape[-1]))
         return mean, self._covariance(self._delivered(prediction.moment, granted))
 
-    def _predict(self, prior: Gaussian, held: Array, moment: Array) -> CentrePrediction:
+    def _predict(self, prior: Gaussian, held: Array, moment: Array) -> Prediction:
         expectation, root = self.filter.expect(prior[0]), linalg.root(prior[1])
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
         spread = linalg.total(observed * observed) + self.sensors.variance
-        return CentrePrediction(expectation, np.sqrt(spread), root, held=held, moment=moment)
+        return Prediction(expectation, np.sqrt(spread), root, prior, held=held, moment=moment)
 
     def _delivered(self, moment: Array, granted: Packets) -> Array:
         """Return Σ after the deliveries (sensors, N)."""
@@ -281,15 +616,13 @@ class TruncatedCentre(FederatedCentre):
     local_means = Centre.local_means
     variances = Centre.variances
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+    def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``time`` has no effect."""
-        return super().predict(mean, covariance, held, time)._replace(held=held)
+        return super().predict(prior, held, time)._replace(held=held)
 
-    def update(
-        self, prior: Gaussian, prediction: CentrePrediction, measurement: Array, granted: Packets
-    ) -> Gaussian:
+    def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`."""
-        mean, covariance = super().update(prior, prediction, measurement, granted)
+        mean, covariance = super().update(prediction, measurement, granted)
         silent = ~granted if prediction.possible is None else ~granted & prediction.possible
         silent = silent & (self.silence.threshold > 0.0)
         if not silent.any():
@@ -346,7 +679,5 @@ def truncated_centre(options: Any, sensors: CensoredSensors) -> TruncatedCentre:
     if not sensors.unlimited:
         allowed = "'kalman', 'tobit' or 'adf' with censored sensors"
         raise refusal("filter", "truncated", allowed)
-    silence = Silence.create(
-        options.trigger, options.trigger_threshold, sensors.count, sensors.size
-    )
+    silence = Silence.create(options, sensors.count, sensors.size)
     return TruncatedCentre(KalmanFilter(sensors), np.ones((sensors.count, 1)), silence)

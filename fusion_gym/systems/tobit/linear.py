@@ -18,7 +18,7 @@ from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 from fusion_gym.systems.silence import Trigger
-from fusion_gym.systems.tobit import options as tobit_options
+from fusion_gym.systems.tobit import system
 from fusion_gym.systems.tobit.centres import (
     HoldCentre,
     JointCentre,
@@ -27,8 +27,8 @@ from fusion_gym.systems.tobit.centres import (
     joint_centre,
     truncated_centre,
 )
+from fusion_gym.systems.tobit.filters import TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _JOINT = "joint_measurement_covariance"
 _HELD = "a centre that holds values cannot hold an estimate"
@@ -39,29 +39,186 @@ _STEP = 0.1  # seconds between two samples of the default target
 _REFERENCE_HORIZON = 10
 
 
-def linear_sensors(
-    states: int, matrices: Any, covariances: Any, joint: Any, threshold: Any, upper: Any
-) -> CensoredSensors:
+_FILTERS = {
+    "kalman": system.FILTERS["kalman"],
+    "tobit": system.at_the_nodes(TobitKalmanFilter),
+    "adf": system.FILTERS["adf"],
+    "stochastic": system.FILTERS["stochastic"],
+    "joint": system.Filter(JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False),
+    "hold": system.Filter(
+        HoldCentre,
+        lambda options, sensors: hold_centre(sensors, _system(options)[0]),
+        nodes=False,
+    ),
+    "truncated": system.Filter(
+        TruncatedCentre, truncated_centre, own=("trigger", "trigger_threshold"), nodes=False
+    ),
+}
+# Observed variances are relative to those after so many silent steps: a target that nobody sees
+# drifts far beyond what is ever unknown of it.
+
+
+@dataclass(frozen=True)
+class LinearFusionOptions(system.FeedbackOptions):
+    """Any linear plant x' = A x + w and any sensors y = C x + v, each of its own size.
+
+    Every sensor has a Kalman filter; the centre fuses them and feeds the result back. If a sensor
+    is censored, the default is one assumed-density filter at the centre. At every step the policy
+    requests transmissions, and the token bucket grants or denies them.
+
+    A sensor whose covariance R is not diagonal reports the equivalent R^(-1/2) y.
+
+    Noises of different sensors are independent, unless you replace ``measurement_covariances`` by
+    ``joint_measurement_covariance``, the covariance of all channels of all sensors in their order.
+    The centre then processes the deliveries in one filter (``"joint"``), or covariance intersection
+    joins the nodes' estimates.
+
+    Starting state: x₀ ~ N(``initial_mean``, ``initial_covariance``), by default zero and the
+    identity. The centre receives the first measurement without charge, and the first estimate uses
+    it.
+
+    The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration. One
+    sensor measures its position in metres, one its velocity in metres a second.
+
+    v2: ``reward_scale`` multiplies the state weights: by default requests at an even pace have
+    errors that cost 1 a step. These errors scale the entries of beliefs. The price of a token is
+    0.5.
+
+    Example:
+        >>> import fusion_gym
+        >>> from fusion_gym.systems.tobit.linear import LinearFusionOptions
+        >>> options = LinearFusionOptions(transition=[[0.9]], process_covariance=[[1.0]],
+        ...     measurement_matrices=[[1.0]])
+        >>> task = fusion_gym.make_task(options)
+        >>> task.sensors, task.plant.state_names
+        (1, ('x1',))
+    """
+
+    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
+    transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
+    """A of x(t+1) = A x(t) + w(t), (n, n)."""
+    process_covariance: ArrayLike = ((_STEP**3 / 3.0, _STEP**2 / 2.0), (_STEP**2 / 2.0, _STEP))
+    """Covariance W of the process noise w, (n, n)."""
+    initial_mean: ArrayLike | None = None
+    """Mean of x₀, (n,). By default 0."""
+    initial_covariance: ArrayLike | None = None
+    """Covariance of x₀, (n, n). By default I."""
+    state_names: Sequence[str] | None = None
+    """Names of the states in tables, figures and the observation. By default x1, x2, …"""
+    measurement_matrices: Sequence[ArrayLike] = ((1.0, 0.0), (0.0, 1.0))
+    """C of each sensor, y = clip(C x + v, τ, υ): a matrix (channels, n), or one row (n,)."""
+    measurement_covariances: ArrayLike | Sequence[ArrayLike] = 0.25
+    """Covariance R of each sensor's noise v: a matrix or a variance per sensor, or one variance for
+    all channels."""
+    joint_measurement_covariance: ArrayLike | None = None
+    """Covariance of all channels of all sensors, in place of ``measurement_covariances``, where
+    noises of different sensors are correlated."""
+    censoring_threshold: ArrayLike | Sequence[ArrayLike] = -np.inf
+    """Lower limit τ: one number, one per sensor, or a list for each sensor with one per channel."""
+    censoring_upper: ArrayLike | Sequence[ArrayLike] = np.inf
+    """Upper limit υ: one number, one per sensor, or a list for each sensor with one per channel."""
+    schedule: Mapping[str, Any] | str | None = None
+    """Matrices that vary with the step, in place of the options of these names: a dictionary, or
+    the path of a YAML or .npz file. ``transition`` and ``process_covariance`` are stacks (T, n, n);
+    ``measurement_matrices`` and ``measurement_covariances`` have a stack for each sensor, (T, m, n)
+    or (T, n), and (T, m, m) or (T,). Entry k leads from step k to k + 1, or measures at step k.
+    After T steps the stacks repeat; with ``end: hold`` the last entry stays. Observed differences
+    are relative to the noise of step 0."""
+    reward_scale: float | Literal["auto"] | None = "auto"
+    cost_weight: float | Literal["random"] = 0.5
+    token_rate: ArrayLike = 1.0
+    token_capacity: ArrayLike = 15.0
+    initial_tokens: ArrayLike = 6.0
+    filter: Annotated[str | None, _FILTERS, NumpyOnly("hold", "truncated")] = None
+    """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
+    ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
+    assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
+    is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the state that fits the
+    last delivered values best, weighted by their noises, without a filter. ``"truncated"`` is one
+    Kalman filter at the centre that uses the silence of the policy ``trigger``; other policies are
+    refused."""
+    trigger: Trigger | None = None
+    """Policy whose silence ``filter="truncated"`` uses."""
+    trigger_threshold: ArrayLike | None = None
+    """Threshold or reportable change of the policy ``trigger``: one number, or one per sensor, in
+    the unit of the measurement."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "schedule", read_schedule(self.schedule))
+
+    def nominal(self) -> LinearFusionOptions:
+        """Return the options whose simulation scales the reward, equal for all filters."""
+        own = ("filter", "fusion", "information_shares", "order", "stochastic_weight", "trigger")
+        left_out: dict[str, Any] = dict.fromkeys((*own, "trigger_threshold"))
+        return replace(super().nominal(), **left_out)
+
+
+def build_linear(choice: LinearFusionOptions) -> Scenario:
+    """Return the scenario of these options."""
+    validation.horizon(choice.horizon)
+    plant, sensors = _system(choice)
+    correlated = sensors.noise_correlation is not None
+    if choice.filter is None:
+        default = "joint" if correlated else "kalman"
+        choice = replace(choice, filter=default if sensors.unlimited else "adf")
+    if correlated:
+        _check_rules(choice)
+    holds = choice.filter == "hold"
+    scenario = system.feedback_scenario(
+        choice,
+        _FILTERS,
+        plant,
+        sensors,
+        _names(choice.state_names, plant.size),
+        _REFERENCE_HORIZON,
+        memory_filter="kalman" if holds and choice.memory_filter is None else choice.memory_filter,
+        known_start=True,
+        no_estimates=_HELD if holds else None,
+        required_policy=choice.trigger,
+    )
+    centre = cast(Any, scenario.estimator).centre
+    if isinstance(centre, TruncatedCentre):
+        scenario.policy_defaults.update(centre.silence.policy_defaults)
+    return scenario
+
+
+def _system(options: LinearFusionOptions) -> Sequence[Any]:
+    """Return plant and sensors."""
+    return scheduled_parts(options, _SCHEDULED, _parts)
+
+
+def _parts(options: LinearFusionOptions, _: object) -> tuple[LinearPlant, CensoredSensors]:
+    transition = validation.array("transition", options.transition, (None, None))
+    size = len(transition)
+    mean = np.zeros(size) if options.initial_mean is None else options.initial_mean
+    start = np.eye(size) if options.initial_covariance is None else options.initial_covariance
+    plant = LinearPlant.create(transition, options.process_covariance, mean, start)
+    return plant, _sensors(options, size)
+
+
+def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
     """Return sensors with the channels of the largest; the last channels of the others are absent.
 
     A sensor whose own covariance R is not diagonal reports F⁻¹ y with F Fᵀ = R.
 
     Args:
+        options: options of the environment.
         states: number of states n.
-        matrices: C of each sensor, (channels, n) or one row (n,).
-        covariances: R of each sensor, for independent sensors.
-        joint: covariance of all channels of all sensors, or None.
-        threshold: lower limits: one number, one per sensor, or a list for each sensor.
-        upper: upper limits, in the same form.
 
     Raises:
         ConfigurationError: a value that is not allowed, or censoring of correlated sensors.
     """
-    rows = _matrices(matrices, states)
+    joint, covariances = options.joint_measurement_covariance, options.measurement_covariances
+    default = LinearFusionOptions.measurement_covariances
+    if joint is not None and plain_options(covariances) != default:
+        allowed = "left out with joint_measurement_covariance"
+        raise validation.refusal("measurement_covariances", covariances, allowed)
+    rows = _matrices(options.measurement_matrices, states)
     sizes = [len(row) for row in rows]
     shape = (len(sizes), max(sizes))
-    low = _limits("censoring_threshold", threshold, sizes, -np.inf)
-    high = _limits("censoring_upper", upper, sizes, np.inf)
+    low = _limits("censoring_threshold", options.censoring_threshold, sizes, -np.inf)
+    high = _limits("censoring_upper", options.censoring_upper, sizes, np.inf)
     present = np.arange(shape[1]) < np.array(sizes)[:, None]
     whole = None
     if joint is None:
@@ -141,186 +298,6 @@ def _dimensions(value: Any) -> int:
     while isinstance(value, (list, tuple)):
         depth, value = depth + 1, value[0] if value else 0.0
     return depth + (value.ndim if isinstance(value, np.ndarray) else 0)
-
-
-_FILTERS = {
-    "kalman": tobit_options.FILTERS["kalman"],
-    "tobit": tobit_options.at_the_nodes(TobitKalmanFilter),
-    "adf": tobit_options.FILTERS["adf"],
-    "stochastic": tobit_options.FILTERS["stochastic"],
-    "joint": tobit_options.Filter(
-        JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False
-    ),
-    "hold": tobit_options.Filter(
-        HoldCentre,
-        lambda options, sensors: hold_centre(sensors, _system(options)[0]),
-        nodes=False,
-    ),
-    "truncated": tobit_options.Filter(
-        TruncatedCentre, truncated_centre, own=("trigger", "trigger_threshold"), nodes=False
-    ),
-}
-# Observed variances are relative to those after so many silent steps: a target that nobody sees
-# drifts far beyond what is ever unknown of it.
-
-
-@dataclass(frozen=True)
-class LinearFusionOptions(tobit_options.FeedbackOptions):
-    """Any linear plant x' = A x + w and any sensors y = C x + v, each of its own size.
-
-    Every sensor has a Kalman filter; the centre fuses them and feeds the result back. If a sensor
-    is censored, the default is one assumed-density filter at the centre. At every step the policy
-    requests transmissions, and the token bucket grants or denies them.
-
-    A sensor whose covariance R is not diagonal reports the equivalent R^(-1/2) y.
-
-    Noises of different sensors are independent, unless you replace ``measurement_covariances`` by
-    ``joint_measurement_covariance``, the covariance of all channels of all sensors in their order.
-    The centre then processes the deliveries in one filter (``"joint"``), or covariance intersection
-    joins the nodes' estimates.
-
-    Starting state: x₀ ~ N(``initial_mean``, ``initial_covariance``), by default zero and the
-    identity. The centre receives the first measurement without charge, and the first estimate uses
-    it.
-
-    The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration. One
-    sensor measures its position in metres, one its velocity in metres a second.
-
-    v2: ``reward_scale`` multiplies the state weights: by default requests at an even pace have
-    errors that cost 1 a step. These errors scale the entries of beliefs. The price of a token is
-    0.5.
-
-    Example:
-        >>> import fusion_gym
-        >>> from fusion_gym.systems.tobit.linear import LinearFusionOptions
-        >>> options = LinearFusionOptions(transition=[[0.9]], process_covariance=[[1.0]],
-        ...     measurement_matrices=[[1.0]])
-        >>> task = fusion_gym.make_task(options)
-        >>> task.sensors, task.plant.state_names
-        (1, ('x1',))
-    """
-
-    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)
-    transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
-    """A of x(t+1) = A x(t) + w(t), (n, n)."""
-    process_covariance: ArrayLike = ((_STEP**3 / 3.0, _STEP**2 / 2.0), (_STEP**2 / 2.0, _STEP))
-    """Covariance W of the process noise w, (n, n)."""
-    initial_mean: ArrayLike | None = None
-    """Mean of x₀, (n,). By default 0."""
-    initial_covariance: ArrayLike | None = None
-    """Covariance of x₀, (n, n). By default I."""
-    state_names: Sequence[str] | None = None
-    """Names of the states in tables, figures and the observation. By default x1, x2, …"""
-    measurement_matrices: Sequence[ArrayLike] = ((1.0, 0.0), (0.0, 1.0))
-    """C of each sensor, y = clip(C x + v, τ, υ): a matrix (channels, n), or one row (n,)."""
-    measurement_covariances: ArrayLike | Sequence[ArrayLike] = 0.25
-    """Covariance R of each sensor's noise v: a matrix or a variance per sensor, or one variance for
-    all channels."""
-    joint_measurement_covariance: ArrayLike | None = None
-    """Covariance of all channels of all sensors, in place of ``measurement_covariances``, where
-    noises of different sensors are correlated."""
-    censoring_threshold: ArrayLike | Sequence[ArrayLike] = -np.inf
-    """Lower limit τ: one number, one per sensor, or a list for each sensor with one per channel."""
-    censoring_upper: ArrayLike | Sequence[ArrayLike] = np.inf
-    """Upper limit υ: one number, one per sensor, or a list for each sensor with one per channel."""
-    schedule: Mapping[str, Any] | str | None = None
-    """Matrices that vary with the step, in place of the options of these names: a dictionary, or
-    the path of a YAML or .npz file. ``transition`` and ``process_covariance`` are stacks (T, n, n);
-    ``measurement_matrices`` and ``measurement_covariances`` have a stack for each sensor, (T, m, n)
-    or (T, n), and (T, m, m) or (T,). Entry k leads from step k to k + 1, or measures at step k.
-    After T steps the stacks repeat; with ``end: hold`` the last entry stays. Observed differences
-    are relative to the noise of step 0."""
-    reward_scale: float | Literal["auto"] | None = "auto"
-    cost_weight: float | Literal["random"] = 0.5
-    token_rate: ArrayLike = 1.0
-    token_capacity: ArrayLike = 15.0
-    initial_tokens: ArrayLike = 6.0
-    filter: Annotated[str | None, _FILTERS, NumpyOnly("hold", "truncated")] = None
-    """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
-    ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
-    assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
-    is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the state that fits the
-    last delivered values best, weighted by their noises, without a filter. ``"truncated"`` is one
-    Kalman filter at the centre that uses the silence of the policy ``trigger``; other policies are
-    refused."""
-    trigger: Trigger | None = None
-    """Policy whose silence ``filter="truncated"`` uses."""
-    trigger_threshold: ArrayLike | None = None
-    """Threshold or reportable change of the policy ``trigger``: one number, or one per sensor, in
-    the unit of the measurement."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "schedule", read_schedule(self.schedule))
-
-    def nominal(self) -> LinearFusionOptions:
-        """Return the options whose simulation scales the reward, equal for all filters."""
-        own = ("filter", "fusion", "information_shares", "order", "stochastic_weight", "trigger")
-        left_out: dict[str, Any] = dict.fromkeys((*own, "trigger_threshold"))
-        return replace(super().nominal(), **left_out)
-
-
-def build_linear(choice: LinearFusionOptions) -> Scenario:
-    """Return the scenario of these options."""
-    validation.horizon(choice.horizon)
-    plant, sensors = _system(choice)
-    correlated = sensors.noise_correlation is not None
-    if choice.filter is None:
-        default = "joint" if correlated else "kalman"
-        choice = replace(choice, filter=default if sensors.unlimited else "adf")
-    if correlated:
-        _check_rules(choice)
-    holds = choice.filter == "hold"
-    scenario = tobit_options.feedback_scenario(
-        choice,
-        _FILTERS,
-        plant,
-        sensors,
-        _names(choice.state_names, plant.size),
-        _REFERENCE_HORIZON,
-        memory_filter="kalman" if holds and choice.memory_filter is None else choice.memory_filter,
-        known_start=True,
-        no_estimates=_HELD if holds else None,
-        required_policy=choice.trigger,
-    )
-    centre = cast(Any, scenario.estimator).centre
-    if isinstance(centre, TruncatedCentre):
-        scenario.policy_defaults.update(centre.silence.policy_defaults)
-    return scenario
-
-
-def _system(options: LinearFusionOptions) -> Sequence[Any]:
-    """Return plant and sensors."""
-    return scheduled_parts(options, _SCHEDULED, _parts)
-
-
-def _parts(options: LinearFusionOptions, _: object) -> tuple[LinearPlant, CensoredSensors]:
-    plant = _plant(options)
-    return plant, _sensors(options, plant.size)
-
-
-def _plant(options: LinearFusionOptions) -> LinearPlant:
-    transition = validation.array("transition", options.transition, (None, None))
-    size = len(transition)
-    mean = np.zeros(size) if options.initial_mean is None else options.initial_mean
-    start = np.eye(size) if options.initial_covariance is None else options.initial_covariance
-    return LinearPlant.create(transition, options.process_covariance, mean, start)
-
-
-def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
-    joint, own = options.joint_measurement_covariance, options.measurement_covariances
-    default = LinearFusionOptions.measurement_covariances
-    if joint is not None and plain_options(own) != default:
-        allowed = "left out with joint_measurement_covariance"
-        raise validation.refusal("measurement_covariances", own, allowed)
-    return linear_sensors(
-        states,
-        options.measurement_matrices,
-        own,
-        joint,
-        options.censoring_threshold,
-        options.censoring_upper,
-    )
 
 
 def _names(value: Any, states: int) -> tuple[str, ...]:

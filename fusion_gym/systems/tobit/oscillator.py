@@ -20,10 +20,14 @@ from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states, trigger_parameters
-from fusion_gym.systems.tobit import options as tobit_options
-from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
+from fusion_gym.systems.tobit import system
+from fusion_gym.systems.tobit.filters import (
+    BoundConstants,
+    BoundTobitFilter,
+    EventError,
+    TobitKalmanFilter,
+)
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
@@ -32,19 +36,17 @@ _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
 _HELD = "the silent filter continues from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
-    "paper": tobit_options.Filter(
+    "paper": system.Filter(
         BoundTobitFilter,
-        lambda options, sensors: tobit_options.feedback_centre(
-            options, _bound_filter(options, sensors)
-        ),
+        lambda options, sensors: system.feedback_centre(options, _bound_filter(options, sensors)),
     ),
-    "tobit": tobit_options.at_the_nodes(TobitKalmanFilter),
-    **tobit_options.FILTERS,
+    "tobit": system.at_the_nodes(TobitKalmanFilter),
+    **system.FILTERS,
 }
 
 
 @dataclass(frozen=True)
-class TobitOscillatorOptions(tobit_options.FeedbackOptions):
+class TobitOscillatorOptions(system.FeedbackOptions):
     """An oscillator measured by three sensors that are censored below a threshold.
 
     The plant is a rotation by 0.052 π a step, driven by noise. Three sensors measure both states
@@ -70,7 +72,7 @@ class TobitOscillatorOptions(tobit_options.FeedbackOptions):
         (3, ('x1', 'x2'))
     """
 
-    filters: ClassVar[Mapping[str, type]] = tobit_options.classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
     transition: ArrayLike = ((_COS, _SIN), (-_SIN, _COS))
     """A of equation (1), (n, n). By default a rotation by 0.052 π."""
     process_noise: Literal["scalar", "full"] = "scalar"
@@ -142,7 +144,7 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
         # The paper's minimises a bound; with every measurement it errs thrice.
         memory_filter = "adf"
     holds = options.filter == "paper" and options.silent != "predict"
-    return tobit_options.feedback_scenario(
+    return system.feedback_scenario(
         options,
         _FILTERS,
         plant,
@@ -177,7 +179,7 @@ def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> 
         allowed = f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound"
         raise validation.refusal("bound_epsilon", options.bound_epsilon, allowed)
     trigger = _trigger(options, sensors.count)
-    error = EventError.create(**trigger, young=options.bound_young, sensors=sensors.count)
+    error = EventError.create(trigger, options.bound_young, sensors.count)
     with_error = options.event_error is None or options.event_error
     hold = options.silent != "predict"
     if with_error and options.filter == "paper":

@@ -1,4 +1,4 @@
-"""A linear plant and censored sensors, with nodes and a fusion centre.
+"""A linear plant with censored sensors, its estimator, and the scenario of their options.
 
 Source: tobit_token_bucket (Chen, Han, Song and Zhang, Complex Eng. Syst. 4:19, 2024);
 round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
@@ -7,26 +7,54 @@ round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import Block, Signal, age_block, common_signals, numbered, sensed
-from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.plant import AS_ASSUMED, Nature, Plant, true_noise
+from fusion_gym.core.task import PaperOptions, Scenario
+from fusion_gym.declaration import plain_options
+from fusion_gym.errors import ConfigurationError, forbidden, refusal
+from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.namespace import namespace
 from fusion_gym.systems import parts
-from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
-from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
+from fusion_gym.systems.linear_plant import (
+    LinearPlant,
+    largest_ratio,
+    typical_magnitude,
+    variance_loss,
+)
+from fusion_gym.systems.solvable import LinearEstimator, LinearProblem
+from fusion_gym.systems.tobit.centres import (
+    Centre,
+    FederatedCentre,
+    FeedbackCentre,
+    Prediction,
+    SequentialCentre,
+    information_shares,
+)
+from fusion_gym.systems.tobit.filters import (
+    AssumedDensityFilter,
+    KalmanFilter,
+    NodeFilter,
+    StochasticEventFilter,
+)
 from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.validation import choice
 
 _TINY = float(np.finfo(float).tiny)  # stands for a variance of zero
+_OF_FUSION = ("fusion", "information_shares", "order")
+_STRUCTURE = Structure(
+    common="all nodes start from the same prediction", holds=("information shares",)
+)
 
 
 @dataclass(frozen=True)
@@ -138,8 +166,7 @@ class DailyLevel:
 
     def reading(self, deviation: Array, level: Array) -> Array:
         """Return the reading (l, 1, N) without rounding errors, which would count as changes."""
-        result: Array = np.round((deviation + level) / self.quantum) * self.quantum
-        return result
+        return np.round((deviation + level) / self.quantum) * self.quantum
 
 
 @dataclass(slots=True)
@@ -155,7 +182,7 @@ class CensoredEstimate(parts.Deliveries):
     time: Array
     prior_mean: Array
     prior_covariance: Array
-    prediction: CentrePrediction | None
+    prediction: Prediction | None
     mean: Array
     covariance: Array
     day: Array | None = None
@@ -173,7 +200,9 @@ _SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a re
 
 
 @dataclass(frozen=True)
-class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
+class CensoredEstimator(
+    parts.AdoptingEstimator[CensoredEstimate], LinearEstimator[CensoredEstimate]
+):
     """A centre with or without nodes.
 
     ``model`` is the plant that the filters assume. ``scale`` (n,) divides observed state estimates
@@ -221,6 +250,27 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
         """Weights (n,) of the traces among the signals: all 1, a plain trace as in the papers."""
         return np.ones(self.model.size)
 
+    def linear_problem(self, plant: Plant[Any], where: str) -> LinearProblem | None:
+        """See :class:`LinearEstimator`."""
+        if type(plant) is not CensoredPlant:
+            return None
+        dynamics, sensors = plant.dynamics, plant.sensors
+        if self.model is not dynamics:
+            reason = "the filters must predict with the plant's own matrix"
+            raise forbidden("bias_aware", False, reason, where)
+        plant.nature.refuse(where)
+        for part in (dynamics, sensors):
+            part.refuse_schedule(where)
+        if not self.centre.predicts:
+            raise ConfigurationError(
+                f"filter is not allowed {where}: in silence the centre must predict, so neither "
+                "hold the last value (filter='paper' with silent='hold') nor use the information "
+                "of silence (filter='stochastic')"
+            )
+        motion = dynamics.transition, dynamics.process_covariance, dynamics.initial_covariance
+        both = sensors.stacked_matrix, sensors.noise_covariance
+        return LinearProblem(*(array[..., 0] for array in (*motion, *both)))
+
     def with_model(
         self,
         process_covariance: Array | None = None,
@@ -236,7 +286,7 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
             measurement_variance: R (sensors, m).
             information_shares: (sensors,), of sum 1.
         """
-        model, centre = self.model, self.centre
+        model, centre = self.model, cast(Any, self.centre)
         if process_covariance is not None:
             model.refuse_schedule("with another process covariance")
             model = replace(model, process_covariance=process_covariance[..., None])
@@ -245,10 +295,9 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
             variance = measurement_variance[..., None]
             deviation = namespace(variance).sqrt(variance)
             sensors = replace(centre.sensors, variance=variance, deviation=deviation)
-            node: Any = cast(Any, centre).filter
-            centre = replace(cast(Any, centre), filter=replace(node, sensors=sensors))
+            centre = replace(centre, filter=replace(centre.filter, sensors=sensors))
         if information_shares is not None:
-            centre = replace(cast(Any, centre), share=information_shares[:, None])
+            centre = replace(centre, share=information_shares[:, None])
         return replace(self, model=model, centre=centre)
 
     @property
@@ -309,11 +358,11 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
             return first
         if self.level is not None:
             filled = np.nan_to_num(measurement)
-            first.prediction = self.centre.predict(mean, covariance, filled, first.time)
+            first.prediction = self.centre.predict((mean, covariance), filled, first.time)
             first = self.observe(first, measurement)
             first.held = first.measurement
         centre = self.centre.at(first.time)
-        prediction = centre.predict(mean, covariance, first.held, first.time)
+        prediction = centre.predict((mean, covariance), first.held, first.time)
         everyone = xp.ones((sensors.count, runs), dtype=np.bool_)
         result = self.update(replace(first, prediction=prediction), Reception(everyone))
         return replace(result, prediction=None, age=first.age)
@@ -328,15 +377,10 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
             held = held - (self._level(state, time) - self._level(state, state.time))
             state = replace(state, held=held)
         model, centre = self.model.at(state.time), self.centre.at(time)
-        (prior_mean, prior_covariance), prediction = centre.advance(model, state)
-        return replace(
-            state,
-            age=state.age + 1.0,
-            time=time,
-            prior_mean=prior_mean,
-            prior_covariance=prior_covariance,
-            prediction=prediction,
-        )
+        prediction = centre.advance(model, state)
+        mean, covariance = prediction.prior
+        state = replace(state, prior_mean=mean, prior_covariance=covariance, prediction=prediction)
+        return replace(state, age=state.age + 1.0, time=time)
 
     def observe(self, state: CensoredEstimate, measurement: Array) -> CensoredEstimate:
         """See :class:`Estimator`; a sensor without a reading has the expectation."""
@@ -352,14 +396,14 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
 
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
-        prior, prediction = (state.prior_mean, state.prior_covariance), sensed(state.prediction)
+        prediction = sensed(state.prediction)
         if self.reads_silence:
             prediction = prediction._replace(possible=reception.possible)
         arrived = reception.arrived
         if state.available is not None:
             arrived = arrived & state.available
         centre = self.centre.at(state.time)
-        mean, covariance = centre.update(prior, prediction, state.measurement, arrived)
+        mean, covariance = centre.update(prediction, state.measurement, arrived)
         return state.after(arrived, prediction=prediction, mean=mean, covariance=covariance)
 
     def single_deliveries(self, state: CensoredEstimate) -> tuple[Array, Array] | None:
@@ -367,8 +411,7 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
         centre = self.centre.at(state.time)
         if not centre.separable:
             return None
-        prior = state.prior_mean, state.prior_covariance
-        means, covariances = centre.single(prior, sensed(state.prediction), state.measurement)
+        means, covariances = centre.single(sensed(state.prediction), state.measurement)
         if state.available is not None:
             silent = self.update(state, Reception(np.zeros_like(state.available))).covariance
             covariances = np.where(state.available[:, None, None], covariances, silent)
@@ -380,9 +423,8 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
-            prior = state.prior_mean, state.prior_covariance
             centre = self.centre.at(state.time)
-            return centre.variances(prior, sensed(state.prediction), self.state_weights)
+            return centre.variances(sensed(state.prediction), self.state_weights)
 
         values: dict[str, Any] = {
             **super().read(state, failure),
@@ -408,8 +450,7 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
 
     def _level(self, state: CensoredEstimate, time: Array) -> Array:
         level: Any = self.level
-        result: Array = level.at(state.day, time)
-        return result
+        return level.at(state.day, time)
 
     def _log_variance(self, state: CensoredEstimate) -> Array:
         variances = (linalg.diagonal(state.prior_covariance), self.reference[:, None])
@@ -422,11 +463,184 @@ class CensoredEstimator(parts.AdoptingEstimator[CensoredEstimate]):
         """Return the nodes' posterior means (sensors, n, N) before the feedback."""
         if state.prediction is None:
             return super().local_means(state)
-        prior, arrived = (state.prior_mean, state.prior_covariance), state.age == 0.0
-        centre = self.centre.at(state.time)
-        return centre.local_means(prior, state.prediction, state.measurement, arrived)
+        centre, arrived = self.centre.at(state.time), state.age == 0.0
+        return centre.local_means(state.prediction, state.measurement, arrived)
 
 
 def _whitened(state: CensoredEstimate) -> Array:
     expectation, deviation = sensed(state.prediction)[:2]
     return (state.measurement - expectation.value) / deviation
+
+
+@dataclass(frozen=True)
+class FeedbackOptions(PaperOptions):
+    """Options of the fusion and its feedback; ``None`` is the default of the filter or the rule."""
+
+    structure: ClassVar[Structure | None] = _STRUCTURE
+    fusion: Annotated[str | None, _STRUCTURE.offered] = None
+    """Rule that joins the nodes' estimates, by default ``"federated"`` (tobit_token_bucket,
+    equations (50) and (51)). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for
+    two sensors. ``"sci"`` and ``"sici"`` join two estimates at a time."""
+    information_shares: ArrayLike | None = None
+    """Shares w of the information that each node gets back under ``"federated"``, with the sum 1.
+    Equal by default (tobit_token_bucket, equation (51))."""
+    order: ArrayLike | None = None
+    """Order of arrival under ``"sci"`` and ``"sici"``: a permutation of the sensors."""
+    stochastic_weight: ArrayLike | None = None
+    """Weight Z of the policy ``stochastic_event``: one number > 0, or one per sensor, in the
+    inverse squared unit of the measurement. ``filter="stochastic"`` needs it."""
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A row of a table of filters: its class, and the function that makes its centre.
+
+    The docstring of ``kind`` has meaning, equation, assumption and source. ``own`` are options of
+    this filter only; for other filters they are ``None``. ``nodes`` says whether the filter has
+    nodes; without nodes the options of their fusion are ``None``.
+    """
+
+    kind: type
+    make: Callable[[Any, CensoredSensors], Centre]
+    own: tuple[str, ...] = ()
+    nodes: bool = True
+
+
+def at_the_nodes(kind: Any) -> Filter:
+    """Return the row of a node filter without options of its own."""
+    return Filter(kind, lambda options, sensors: feedback_centre(options, kind(sensors)))
+
+
+def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
+    """Return the class of each filter of a table."""
+    return {name: row.kind for name, row in filters.items()}
+
+
+def feedback_scenario(
+    options: Any,
+    filters: Mapping[str, Filter],
+    plant: LinearPlant,
+    sensors: CensoredSensors,
+    state_names: tuple[str, ...],
+    reference_horizon: int,
+    *,
+    memory_filter: str | None,
+    policy_defaults: Mapping[str, dict[str, Any]] | None = None,
+    random_start: bool = False,
+    model: LinearPlant | None = None,
+    known_start: bool = False,
+    **others: Any,
+) -> Scenario:
+    """Return the scenario of a linear plant, its sensors and the option ``filter``.
+
+    Options of the memory's filter are the environment's own where both filters have them, and
+    otherwise defaults.
+
+    Args:
+        options: options of the environment.
+        filters: the table of filters.
+        plant: the true plant.
+        sensors: the sensors.
+        state_names: names of the states.
+        reference_horizon: steps without transmissions whose variances scale observed variances.
+        memory_filter: name of the memory's filter, or None for the same filter.
+        policy_defaults: parameters of policies.
+        random_start: whether the initial mean has a random direction.
+        model: the plant that the filters assume, by default ``plant``.
+        known_start: whether the estimate begins with the first measurement of every sensor.
+        **others: other fields of the scenario.
+
+    Raises:
+        ConfigurationError: an unknown filter, an option of another filter, or a departure of the
+            truth that is not allowed or has no effect.
+    """
+    kind = choice("filter", options.filter, filters)
+    where = f"filter={kind!r}"
+    for name, row in filters.items():
+        if name != kind:
+            _refuse(options, row.own, where, f"filter={name!r}")
+    if not filters[kind].nodes:
+        belongs = "a filter with nodes (here the centre uses the measurements)"
+        _refuse(options, _OF_FUSION, where, belongs)
+    centre = filters[kind].make(options, sensors)
+    if centre.reads_silence and options.channel != "perfect":
+        raise refusal("channel", options.channel, "'perfect', because a loss is no silence", where)
+    absent = ("true_threshold_shift",) if sensors.unlimited else ()
+    nature = Nature.create(options, (*plant.unmoved, *absent))
+    nature.check_growth(plant.true_radius, options.horizon)
+    if plant.schedule is None and sensors.schedule is None:
+        plant.warn_of_unseen_growth(sensors.stacked_matrix, state_names)
+    estimator = CensoredEstimator(
+        model=plant if model is None else model,
+        centre=centre,
+        state_names=state_names,
+        scale=typical_magnitude(plant, options.horizon, random_start),
+        reference=plant.open_loop(min(options.horizon, reference_horizon)),
+        known_start=known_start,
+    )
+    memory = None
+    if memory_filter is not None:
+        row = filters[choice("memory_filter", memory_filter, filters)]
+        changed: dict[str, Any] = dict.fromkeys(() if row.nodes else _OF_FUSION)
+        changed["filter"] = memory_filter
+        memory = replace(estimator, centre=row.make(replace(options, **changed), sensors))
+    defaults: dict[str, Any] = dict(policy_defaults or {})
+    if options.stochastic_weight is not None:
+        defaults["stochastic_event"] = {"weight": plain_options(options.stochastic_weight)}
+    return Scenario(
+        options,
+        CensoredPlant(plant, sensors, state_names, random_start, nature),
+        estimator,
+        policy_defaults=defaults,
+        feedback=True,
+        memory_estimator=memory,
+        **others,
+    )
+
+
+def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
+    """Return nodes with this filter and the options' fusion.
+
+    Args:
+        options: options of the environment.
+        node: the nodes' filter.
+
+    Raises:
+        ConfigurationError: a rule that does not fit, or an option of another rule.
+    """
+    sensors = node.sensors.count
+    kind = "federated" if options.fusion is None else options.fusion
+    weights = options.own_weights(node.sensors.measurement_matrix.shape[2])
+    fusion = choose_rule(kind, _STRUCTURE, sensors, options.order, weights)
+    if kind == "federated":
+        share = information_shares(options.information_shares, sensors)
+        if isinstance(node, KalmanFilter):
+            return FederatedCentre(node, share)
+        return FeedbackCentre(node, share, fusion)
+    _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
+    return FeedbackCentre(node, np.ones((sensors, 1)), fusion)
+
+
+# What every environment of the family offers; each adds its paper's own.
+FILTERS = {
+    "kalman": at_the_nodes(KalmanFilter),
+    "adf": Filter(
+        AssumedDensityFilter,
+        lambda _, sensors: SequentialCentre(AssumedDensityFilter(sensors)),
+        nodes=False,
+    ),
+    "stochastic": Filter(
+        StochasticEventFilter,
+        lambda options, sensors: feedback_centre(
+            options, StochasticEventFilter.create(sensors, options.stochastic_weight)
+        ),
+        own=("stochastic_weight",),
+    ),
+}
+
+
+def _refuse(options: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:
+    for name in names:
+        value = getattr(options, name)
+        if value is not None:
+            raise forbidden(name, value, f"it belongs to {belongs}", f"with {where}")

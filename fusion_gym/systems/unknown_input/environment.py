@@ -23,9 +23,17 @@ from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.parts import numbered_states
-from fusion_gym.systems.unknown_input import filters, signals
+from fusion_gym.systems.unknown_input import filters
 from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
-from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
+from fusion_gym.systems.unknown_input.plant import (
+    ArrayInput,
+    InputSensors,
+    InputSignal,
+    MeanRevertingWalk,
+    Sinusoids,
+    Steps,
+    UnknownInputPlant,
+)
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 
 
@@ -225,13 +233,9 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
     """Return the scenario of these options."""
     options = _with_example(choice)
     horizon = validation.horizon(options.horizon)
-    motion = options.transition, options.input_matrix, options.process_covariance
-    start = options.initial_mean, options.initial_covariance, options.initial_half_width
-    plant = UnknownInputPlant.create(*motion, options.sampling_period, *start)
+    plant = UnknownInputPlant.create(options)
     signal = _signal(options, plant.inputs, horizon)
-    sensors = InputSensors.create(
-        options.measurement_matrices, options.measurement_covariance, plant
-    )
+    sensors = InputSensors.create(options, plant)
     trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
     if np.any(open_loop[plant.size :] <= 0.0):
@@ -319,31 +323,29 @@ def _with_example(options: UnknownInputOptions) -> Any:
     return replace(options, **missing)
 
 
-def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> signals.InputSignal:
+def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
     kind = options.input_signal
     shape = {name: getattr(options, name) for name in _SHAPE}
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
                 raise refusal(name, value, "None", "with an array as input_signal")
-        return signals.ArrayInput.create(inputs, kind, horizon)
+        return ArrayInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
     if kind == "sinusoids":
-        return signals.Sinusoids.create(inputs, amplitude, period, phase)
+        return Sinusoids.create(inputs, amplitude, period, phase)
     if not (isinstance(phase, str) and phase == "random"):
         reason = "phases belong to 'sinusoids'"
         raise forbidden("input_phase", phase, reason, f"with input_signal={kind!r}")
     if kind == "steps":
-        return signals.Steps.create(inputs, amplitude, period)
-    return signals.MeanRevertingWalk.create(inputs, amplitude, period)
+        return Steps.create(inputs, amplitude, period)
+    return MeanRevertingWalk.create(inputs, amplitude, period)
 
 
 def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:
     kind = validation.choice("filter", options.filter, FILTERS)
-    factor = validation.positive("young_factor", options.young_factor, (sensors.count,))
-    model = filters.InputModel.create(
-        plant, options.input_memory, options.input_change, options.input_deviation
-    )
+    validation.positive("young_factor", options.young_factor, (sensors.count,))
+    model = filters.InputModel.create(plant, options)
     joint = filters.JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
     weights = options.own_weights(plant.size + plant.inputs)
@@ -353,8 +355,7 @@ def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizo
         reason = "it belongs to filter='random_walk'"
         raise forbidden("hold_variance", hold, reason, f"with filter={kind!r}")
     if kind == "paper":
-        bound = options.rho_bar
-        tables = filters.BoundTables.create(joint, model, bound, factor, horizon)
+        tables = filters.BoundTables.create(joint, model, options, horizon)
         return TableNodes.create(model, sensors, tables, fusion)
     if kind == "predict":
         exact = filters.ExactInputStateFilter(model, joint)
@@ -391,8 +392,7 @@ def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Arr
     share[len(share) - inputs :] = validation.number(
         "input_weight", options.input_weight, at_least=0.0
     )
-    weights: Array = share / (share.sum() * open_loop)
-    return weights
+    return share / (share.sum() * open_loop)
 
 
 def _state_names(options: UnknownInputOptions, plant: UnknownInputPlant) -> tuple[str, ...]:

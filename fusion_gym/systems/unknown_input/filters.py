@@ -12,9 +12,9 @@ discrete-time systems", Automatica 43, 2007.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -99,27 +99,24 @@ class InputModel:
     initial_covariance: Array
 
     @classmethod
-    def create(
-        cls, plant: UnknownInputPlant, memory: ArrayLike, change: ArrayLike, deviation: ArrayLike
-    ) -> InputModel:
+    def create(cls, plant: UnknownInputPlant, options: Any) -> InputModel:
         """Return the model of a plant's input.
 
         Args:
             plant: the plant.
-            memory: r in [0, 1]: one number, or one per input.
-            change: deviation of η > 0: one number, or one per input.
-            deviation: deviation > 0 of an input without a measurement: one number, or one per
+            options: ``input_memory`` r in [0, 1], ``input_change``, the deviation of η > 0, and
+                ``input_deviation`` > 0 of an input without a measurement: one number, or one per
                 input.
 
         Raises:
             ConfigurationError: a number outside these limits.
         """
         n, q = plant.size, plant.inputs
-        retention = validation.not_negative("input_memory", memory, (q,))
+        retention = validation.not_negative("input_memory", options.input_memory, (q,))
         if np.any(retention > 1.0):
-            raise validation.refusal("input_memory", memory, ">= 0 and <= 1")
-        steps = validation.positive("input_change", change, (q,))
-        first = validation.positive("input_deviation", deviation, (q,))
+            raise validation.refusal("input_memory", options.input_memory, ">= 0 and <= 1")
+        steps = validation.positive("input_change", options.input_change, (q,))
+        first = validation.positive("input_deviation", options.input_deviation, (q,))
         b = plant.input_matrix[..., 0]
         spread = np.concatenate((b, np.eye(q))) * steps
         noise = spread @ spread.T
@@ -347,21 +344,14 @@ class BoundTables:
     radius: Array
 
     @classmethod
-    def create(
-        cls,
-        joint: JointGain,
-        model: InputModel,
-        rho_bar: ArrayLike,
-        young_factor: ArrayLike,
-        times: int,
-    ) -> BoundTables:
+    def create(cls, joint: JointGain, model: InputModel, options: Any, times: int) -> BoundTables:
         """Return tables for the times 0 to ``times``.
 
         Args:
             joint: the gain of state and input.
             model: the model of the input.
-            rho_bar: ρ̄ in [0, 1]: one number, or one per sensor.
-            young_factor: ε > 0: one number, or one per sensor.
+            options: ``rho_bar`` ρ̄ in [0, 1], ``young_factor`` ε > 0: one number, or one per
+                sensor.
             times: the last time T.
 
         Raises:
@@ -369,10 +359,11 @@ class BoundTables:
         """
         sensors = joint.sensors
         count = sensors.count
-        limit = validation.not_negative("rho_bar", rho_bar, (count,))
+        limit = validation.not_negative("rho_bar", options.rho_bar, (count,))
         if np.any(limit > 1.0):
-            raise validation.refusal("rho_bar", rho_bar, ">= 0 and <= 1")
-        epsilon = validation.positive("young_factor", young_factor, (count,))[:, None, None, None]
+            raise validation.refusal("rho_bar", options.rho_bar, ">= 0 and <= 1")
+        young_factor = validation.positive("young_factor", options.young_factor, (count,))
+        epsilon = young_factor[:, None, None, None]
         plain = (1.0 + epsilon) * sensors.covariance
         square = limit[:, None, None, None] * linalg.identity(sensors.size)
         noise = plain + (1.0 + 1.0 / epsilon) * square
@@ -416,5 +407,4 @@ def _radius(joint: JointGain, model: InputModel, epsilon: Array, noise: Array) -
     seen = linalg.matmul(gain[:, : model.size], joint.sensors.measurement_matrix)
     rest = linalg.identity(model.size) - seen
     closed = linalg.matmul(rest, model.plant.transition)[..., 0] * np.sqrt(growth[..., 0])
-    radius: Array = np.abs(np.linalg.eigvals(closed)).max(-1)
-    return radius
+    return np.abs(np.linalg.eigvals(closed)).max(-1)

@@ -19,8 +19,7 @@ from fusion_gym.namespace import namespace, ndtr
 from fusion_gym.systems.linear_plant import largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
-from fusion_gym.systems.unknown_input.plant import InputSensors, UnknownInputPlant
-from fusion_gym.systems.unknown_input.signals import InputSignal
+from fusion_gym.systems.unknown_input.plant import InputSensors, InputSignal, UnknownInputPlant
 
 _IMAGINED = 32  # signals of which one is taken, where one is imagined
 
@@ -209,16 +208,9 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
             ),
             knowledge.age_block(nodes),
             self.deviation_block(
-                "local_log_deviation",
-                "logarithm of the node's predicted over the open-loop deviation",
-                self._local_log_deviation,
-                nodes,
+                "local_log_deviation", "the node's predicted", self._prior_covariance, nodes
             ),
-            self.deviation_block(
-                "log_deviation",
-                "logarithm of the last fused over the open-loop deviation",
-                self._log_deviation,
-            ),
+            self.deviation_block("log_deviation", "the last fused", self._last_covariance),
             self.estimate_block(
                 "fused prediction over the root mean square",
                 lambda s: knowledge.sensed(s.prediction).fused_mean,
@@ -254,7 +246,8 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
 
     def read(self, state: UnknownInputEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
-        prediction = knowledge.sensed(state.prediction)
+        prediction, n = knowledge.sensed(state.prediction), self.nodes.model.size
+        predict = self.nodes.model.predict_covariance
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
@@ -264,12 +257,12 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
             **super().read(state, failure),
             "innovation": lambda: state.measurement - prediction.expected,
             "expected_measurement": prediction.expected,
-            "innovation_deviation": lambda: _lanes(self._deviation(state), len(state.time)),
-            "prior_mean": prediction.fused_mean[: self.nodes.model.size],
-            "prior_covariance": lambda: _lanes(self._fused_prior(state), len(state.time)),
+            "innovation_deviation": lambda: self._deviation(state),
+            "prior_mean": prediction.fused_mean[:n],
+            "prior_covariance": lambda: predict(self._last_covariance(state))[:n, :n],
             "silent_variance": lambda: variances()[0],
             "variance_reduction": lambda: variances()[1],
-            "local_variance": lambda: self._local_variance(state),
+            "local_variance": lambda: linalg.trace(self._prior_covariance(state)[:, :n, :n]),
         }
 
     def mean(self, state: UnknownInputEstimate) -> Array:
@@ -286,9 +279,8 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
         return state.estimates.mean
 
     def _deviation(self, state: UnknownInputEstimate) -> Array:
-        """Return the innovation's deviation (l, m, N or 1)."""
-        n, sensors = self.nodes.model.size, self.nodes.sensors
-        prior = self.nodes.prior_covariance(knowledge.sensed(state.prediction), state.time)
+        """Return the innovation's deviation (l, m, N)."""
+        n, sensors, prior = self.nodes.model.size, self.nodes.sensors, self._prior_covariance(state)
         spread = linalg.matmul(sensors.measurement_matrix, prior[:, :n, :n])
         variance = spread[..., 0, :] * sensors.measurement_matrix[..., 0, :]
         for column in range(1, n):
@@ -305,23 +297,15 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
         expected = knowledge.sensed(state.prediction).expected
         return (state.measurement - expected) / self._deviation(state)
 
-    def _local_log_deviation(self, state: UnknownInputEstimate) -> Array:
+    def _prior_covariance(self, state: UnknownInputEstimate) -> Array:
+        """Return the nodes' predicted covariances (l, s, s, N)."""
         prior = self.nodes.prior_covariance(knowledge.sensed(state.prediction), state.time)
-        return _lanes(knowledge.log_deviation(prior, self.reference), len(state.time))
+        return _lanes(prior, len(state.time))
 
-    def _log_deviation(self, state: UnknownInputEstimate) -> Array:
+    def _last_covariance(self, state: UnknownInputEstimate) -> Array:
+        """Return the centre's covariance (s, s, N) of one instant before."""
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
-        return _lanes(knowledge.log_deviation(before, self.reference), len(state.time))
-
-    def _local_variance(self, state: UnknownInputEstimate) -> Array:
-        n = self.nodes.model.size
-        prior = self.nodes.prior_covariance(knowledge.sensed(state.prediction), state.time)
-        return _lanes(linalg.trace(prior[:, :n, :n]), len(state.time))
-
-    def _fused_prior(self, state: UnknownInputEstimate) -> Array:
-        n = self.nodes.model.size
-        before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
-        return self.nodes.model.predict_covariance(before)[:n, :n]
+        return _lanes(before, len(state.time))
 
 
 def _lanes(value: Array, runs: int) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 from fusion_gym.systems.correlated.filters import (
     CorrelatedSensors,
     JointErrorCovariance,
@@ -28,7 +29,10 @@ def parts(
     factor = gain * np.sqrt(process)
     plant = LinearPlant.create(transition, factor @ factor.T, np.zeros(n), np.eye(n))
     plant = replace(plant, process_factor=factor[..., None])
-    return plant, CorrelatedSensors.create(matrices, variance, coupling, np.sqrt(process), plant)
+    options = CorrelatedTrackingOptions(
+        measurement_matrices=matrices, measurement_variance=variance, noise_coupling=coupling
+    )
+    return plant, CorrelatedSensors.create(options, np.sqrt(process), plant)
 
 
 def random_parts(

@@ -7,36 +7,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from reference_markov_jump import PAPER, Dense, best_weights, random_model
+from reference_markov_jump import PAPER, Dense, best_weights, options, random_model
 
 from fusion_gym.fusion.rules import MatrixWeightedFusion
-from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
-from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
+from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
+from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    AugmentedModel,
+    LagRecursion,
+    LocalFilters,
+)
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 
 Array = NDArray[np.float64]
 
 
 def parts(model: dict[str, Any]) -> tuple[MarkovJumpPlant, FadingSensors]:
-    plant = MarkovJumpPlant.create(
-        model["transitions"],
-        model["gains"],
-        model["noise"],
-        model["chain"],
-        model["pi"],
-        model["mean"],
-        model["start"],
-    )
-    sensors = FadingSensors.create(
-        model["matrices"],
-        model["periods"],
-        model["values"],
-        model["shares"],
-        model["coupling"],
-        model["variance"],
-        plant,
-    )
-    return plant, sensors
+    own = MarkovJumpTrackingOptions(**options(model))
+    plant = MarkovJumpPlant.create(own)
+    return plant, FadingSensors.create(own, plant)
 
 
 def filters_of(model: dict[str, Any], horizon: int = 50) -> LocalFilters:

@@ -14,9 +14,9 @@ from fusion_gym.core.access import first_requests
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.systems.tobit.filters import AssumedDensityFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator
-from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
 TRACKING = "fusion_gym/BiasedTracking-v1"
@@ -132,8 +132,7 @@ def test_expected_reduction_is_the_mean_over_the_measurements() -> None:
         state.prior_mean[:, 0], state.prior_covariance[..., 0], draws
     ).T
     measurement = centre.sensors.measure(truth, generator.normal(size=(2, draws)))
-    prior, weights = (state.prior_mean, state.prior_covariance), estimator.state_weights
-    silent, reduction = centre.variances(prior, state.prediction, weights)
+    silent, reduction = centre.variances(state.prediction, estimator.state_weights)
     for sensor in range(2):
         granted = np.zeros((2, draws), dtype=np.bool_)
         granted[sensor] = True

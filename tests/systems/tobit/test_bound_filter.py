@@ -29,9 +29,8 @@ from scipy import stats
 import fusion_gym
 from fusion_gym import ConfigurationError
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.systems.tobit.bound_filter import BoundConstants, EventError
+from fusion_gym.systems.tobit.filters import BoundConstants, EventError, TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 OTHER_EPSILON = tuple(np.linspace(0.1, 1.4, 14).tolist())
 NEVER_CENSORED = -math.inf
@@ -72,8 +71,6 @@ PAPER_TRIGGER = {
     "decay": (0.1, 0.2, 0.1),
     "divisor": 5.0,
     "initial": 1.5,
-    "young": (1.5, 2.0),
-    "sensors": 3,
 }
 
 
@@ -84,7 +81,7 @@ PAPER_TRIGGER = {
 )
 def test_event_error_follows_its_recursion_for_every_growth(decay: float) -> None:
     # The growth 7.5 λ² + 0.4 is below, at and above one.
-    error = EventError.create(**(PAPER_TRIGGER | {"decay": decay}))
+    error = EventError.create(PAPER_TRIGGER | {"decay": decay}, (1.5, 2.0), 3)
     values = error.at(np.array([1.0, 2.0, 30.0, 100.0]))
     example = Example(decay=(decay,) * 3)
     for sensor in range(3):
@@ -94,12 +91,14 @@ def test_event_error_follows_its_recursion_for_every_growth(decay: float) -> Non
 
 
 @pytest.mark.parametrize(
-    ("change", "field"),
-    [({"threshold": -0.1}, "trigger_threshold"), ({"young": (0.0, 1.0)}, "bound_young")],
+    ("change", "young", "field"),
+    [({"threshold": -0.1}, (1.5, 2.0), "trigger_threshold"), ({}, (0.0, 1.0), "bound_young")],
 )
-def test_bad_trigger_numbers_are_refused(change: dict[str, Any], field: str) -> None:
+def test_bad_trigger_numbers_are_refused(
+    change: dict[str, Any], young: tuple[float, float], field: str
+) -> None:
     with pytest.raises(ConfigurationError, match=rf"^{field} = .* is not allowed"):
-        EventError.create(**(PAPER_TRIGGER | change))
+        EventError.create(PAPER_TRIGGER | change, young, 3)
 
 
 # --- the paper's filter against the printed equations ------------------------------------------

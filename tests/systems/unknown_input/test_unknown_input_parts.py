@@ -3,6 +3,7 @@
 Oracles: plain matrices and loops, closed forms with explicit inverses, samples.
 """
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from fusion_gym import linalg
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.fusion.several import CovarianceIntersection, covariance_intersection_many
 from fusion_gym.policies.rules.measurements import AdaptiveThreshold
+from fusion_gym.systems.unknown_input.environment import EXAMPLES, UnknownInputOptions
 from fusion_gym.systems.unknown_input.filters import (
     BoundTables,
     InputModel,
@@ -35,7 +37,9 @@ def random_sensors(
     draw = np.random.default_rng(seed)
     root = draw.normal(size=(count, size, size + 2))
     noise = 0.1 * root @ root.swapaxes(1, 2)
-    return InputSensors.create(draw.normal(size=(count, size, plant.size)), noise, plant)
+    matrices = draw.normal(size=(count, size, plant.size))
+    options = UnknownInputOptions(measurement_matrices=matrices, measurement_covariance=noise)
+    return InputSensors.create(options, plant)
 
 
 def random_covariances(seed: int, shape: tuple[int, ...], n: int, runs: int) -> Array:
@@ -91,17 +95,9 @@ def test_gain_hides_the_input_and_is_the_textbooks(seed: int, q: int, size: int)
 
 def test_paper_gain_is_exact_to_rounding() -> None:
     """The paper's C ℬ is nearly singular; normal equations would leave a residual of 1e-7."""
-    plant = UnknownInputPlant.create(
-        ((0.26, 0.3), (0.2, 0.1)),
-        ((1.10, 1.12), (1.15, 1.13)),
-        0.001 * np.eye(2),
-        2,
-        (0.17, 0.17),
-        0.01 * np.eye(2),
-    )
-    sensors = InputSensors.create(
-        (((1.12, 1.13), (1.10, 1.12)), ((1.31, 1.13), (1.31, 1.21))), 0.001, plant
-    )
+    options = SimpleNamespace(sampling_period=2, **EXAMPLES["paper"])
+    plant = UnknownInputPlant.create(options)
+    sensors = InputSensors.create(options, plant)
     joint = JointGain.create(plant, sensors)
     gain = joint.gain(random_covariances(0, (2,), 2, 1), sensors.covariance)
     observed = linalg.matmul(sensors.measurement_matrix, plant.input_matrix)
@@ -118,9 +114,16 @@ def test_paper_gain_is_exact_to_rounding() -> None:
 def test_bound_tables_have_their_radius_and_grow_by_silence() -> None:
     plant = random_plant(18, n=3, q=1)
     sensors = random_sensors(19, plant, count=2, size=3)
-    joint, model = JointGain.create(plant, sensors), InputModel.create(plant, 0.9, 0.3, 0.7)
     epsilon = (0.3, 0.1)
-    tables = BoundTables.create(joint, model, (0.05, 0.2), epsilon, 12)
+    options = UnknownInputOptions(
+        input_memory=0.9,
+        input_change=0.3,
+        input_deviation=0.7,
+        rho_bar=(0.05, 0.2),
+        young_factor=epsilon,
+    )
+    joint, model = JointGain.create(plant, sensors), InputModel.create(plant, options)
+    tables = BoundTables.create(joint, model, options, 12)
     for sensor in range(2):
         observed = tables.gain[sensor, :3, ..., 12] @ sensors.measurement_matrix[sensor, ..., 0]
         moved = np.sqrt(1 + epsilon[sensor]) * (np.eye(3) - observed) @ plant.transition[..., 0]

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from fusion_gym import linalg
-from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
-from fusion_gym.systems.unknown_input.signals import (
+from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
+from fusion_gym.systems.unknown_input.plant import (
     ArrayInput,
     InputSignal,
     MeanRevertingWalk,
     Sinusoids,
     Steps,
+    UnknownInputPlant,
 )
 
 Array = NDArray[np.float64]
@@ -29,14 +30,15 @@ def random_plant(seed: int, n: int = 4, q: int = 2, period: int = 2) -> UnknownI
     transition = draw.normal(size=(n, n))
     transition *= 0.95 / np.abs(np.linalg.eigvals(transition)).max()
     root = draw.normal(size=(n, n))
-    return UnknownInputPlant.create(
-        transition,
-        draw.normal(size=(n, q)),
-        0.1 * root @ root.T,
-        period,
-        draw.normal(size=n),
-        0.5 * np.eye(n),
+    options = UnknownInputOptions(
+        transition=transition,
+        input_matrix=draw.normal(size=(n, q)),
+        process_covariance=0.1 * root @ root.T,
+        sampling_period=period,
+        initial_mean=draw.normal(size=n),
+        initial_covariance=0.5 * np.eye(n),
     )
+    return UnknownInputPlant.create(options)
 
 
 @given(st.integers(0, 10**6), st.integers(1, 4))
@@ -116,15 +118,15 @@ def test_open_loop_and_magnitude_are_those_of_samples(name: str, half_width: flo
     signal, horizon, runs = SIGNALS[name], 12, 8000
     draw = np.random.default_rng(5)
     root = draw.normal(size=(3, 3))
-    plant = UnknownInputPlant.create(
-        0.8 * np.linalg.qr(root)[0],
-        draw.normal(size=(3, 2)),
-        0.05 * np.eye(3),
-        2,
-        (1.0, -0.5, 0.0),
-        0.4 * np.eye(3),
-        half_width,
+    options = UnknownInputOptions(
+        transition=0.8 * np.linalg.qr(root)[0],
+        input_matrix=draw.normal(size=(3, 2)),
+        process_covariance=0.05 * np.eye(3),
+        initial_mean=(1.0, -0.5, 0.0),
+        initial_covariance=0.4 * np.eye(3),
+        initial_half_width=half_width,
     )
+    plant = UnknownInputPlant.create(options)
     inputs = simulate(signal, horizon, runs, 6)
     state = plant.start(draw.standard_normal((3, runs)))
     if half_width is not None:
