@@ -22,22 +22,20 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from fusion_gym.commands.command_line import Long
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Episodes, Long, Seed, whole
 from fusion_gym.commands.evaluate import evaluation_report
-from fusion_gym.commands.options import OUTPUT_FOLDER, Episodes, Seed, whole
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
 from fusion_gym.envs.registration import class_name, make_task
-from fusion_gym.evaluation import envelope
+from fusion_gym.evaluation import metrics
 from fusion_gym.evaluation.episodes import EpisodeResults, run_several
 from fusion_gym.output import figures, tables
 from fusion_gym.output.files import write
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy, policy_names, policy_parameters
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment, Sweep, SweepCurve
-from fusion_gym.training.diagnosis import warn_of_unused_tokens
+from fusion_gym.training.config import Experiment, Sweep, SweepCurve, load_checked
+from fusion_gym.training.monitor import warn_of_unused_tokens
 from fusion_gym.validation import refusal
 
 
@@ -119,10 +117,8 @@ def compare(
     points = []
     for name, item in results.items():
         means = float(item.rate.mean()), float(item.mse.mean())
-        at_price = envelope.compare_at_price(item, baselines, policies[name])
-        points.append(
-            Point(name, *means, at_price, envelope.compare_with_envelope(item, baselines))
-        )
+        at_price = metrics.compare_at_price(item, baselines, policies[name])
+        points.append(Point(name, *means, at_price, metrics.compare_with_envelope(item, baselines)))
     report = evaluation_report(env_id, task, episodes, seed, baselines | results)
     write(folder / "evaluation.json", report)
     write(folder / "comparison.json", {"points": [point.plain() for point in points]})
@@ -174,8 +170,8 @@ class Point(NamedTuple):
     policy: str
     rate: float
     mse: float
-    at_price: envelope.PriceComparison
-    at_rate: envelope.BaselineComparison
+    at_price: metrics.PriceComparison
+    at_rate: metrics.BaselineComparison
 
     def plain(self) -> Plain:
         """Return the point as JSON."""
@@ -229,5 +225,5 @@ def rate_table(points: Sequence[Point]) -> Table:
     heads = "rate", "its MSE", "envelope's MSE", "difference [95 %]", "relative"
     title = f"at equal rate: {label}, and the baselines' lower envelope at the same rate"
     far = any(point.at_rate.far_apart for point in points)
-    note = f"* between baselines whose rates differ by more than {envelope.FAR_APART:g} times"
+    note = f"* between baselines whose rates differ by more than {metrics.FAR_APART:g} times"
     return tables.table_tables(title, ("envelope between", *heads), rows, note if far else None)

@@ -15,9 +15,8 @@ from typing import Annotated
 import tyro
 import yaml
 
-from fusion_gym.commands.command_line import Command
+from fusion_gym.commands.command_line import Command, OutputFile
 from fusion_gym.commands.log_options import FitOptions, warn
-from fusion_gym.commands.options import OutputFile
 from fusion_gym.output.files import write_text
 from fusion_gym.output.progress import writing
 from fusion_gym.output.tables import console, table_tables

@@ -19,13 +19,12 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markdown import Markdown, TableElement
 from rich.table import Table
 
-from fusion_gym.commands.command_line import Command
+from fusion_gym.commands.command_line import Command, OutputFile
+from fusion_gym.commands.list import catalogue
 from fusion_gym.commands.log_options import LogOptions
-from fusion_gym.commands.options import OutputFile
 from fusion_gym.docstrings import plain_marks
 from fusion_gym.envs.registration import present_id
 from fusion_gym.output.tables import console
-from fusion_gym.training.catalogue import catalogue
 from fusion_gym.validation import nearest, refusal
 
 

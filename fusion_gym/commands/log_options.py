@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from fusion_gym.commands.options import between
+from fusion_gym.commands.command_line import between
 from fusion_gym.output.progress import remark, writing
 from fusion_gym.output.tables import console
 

@@ -17,8 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from fusion_gym.commands.command_line import EnvironmentOptions, Long
-from fusion_gym.commands.options import OutputFile, Seed, whole
+from fusion_gym.commands.command_line import EnvironmentOptions, Long, OutputFile, Seed, whole
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
 from fusion_gym.envs.drawing import Frame, Window

@@ -32,8 +32,8 @@ from fusion_gym.evaluation.episodes import run_several
 from fusion_gym.evaluation.rule_loop import RuleLoop, make_loop
 from fusion_gym.importing import require
 from fusion_gym.policies.base import Policy, SearchRange
+from fusion_gym.policies.belief_rules import PricedThreshold, Score
 from fusion_gym.policies.registry import make_policy, search_ranges, with_settings
-from fusion_gym.policies.rules.priced_threshold import PricedThreshold, Score
 from fusion_gym.validation import ConfigurationError
 
 ClassName = Literal["centre", "local", "scheduler"]

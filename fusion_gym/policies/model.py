@@ -17,14 +17,14 @@ from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.errors import forbidden
+from fusion_gym.policies.archive import ENTRY, ModelView, algorithm_name, model_card
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.belief_rule import beliefs_of
-from fusion_gym.policies.card import ENTRY, ModelView, algorithm_name, model_card
+from fusion_gym.policies.belief_rules import beliefs_of
 from fusion_gym.validation import refusal
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
-    """Write the model's card (:mod:`fusion_gym.policies.card`) into it before it is saved."""
+    """Write the model's card (:mod:`fusion_gym.policies.archive`) into it before it is saved."""
     setattr(model, ENTRY, model_card(algorithm_name(model), task, local))
 
 

@@ -22,15 +22,19 @@ from fusion_gym.errors import forbidden
 from fusion_gym.importing import trust_files
 from fusion_gym.output import files
 from fusion_gym.output.progress import progress_bar, quietly, remark, writing
-from fusion_gym.policies.loading import load_model_policy
 from fusion_gym.policies.model import tag_model
-from fusion_gym.training.algorithms import TABLE
+from fusion_gym.policies.saved import load_model_policy
 from fusion_gym.training.calibration import calibrate
-from fusion_gym.training.checked import load_checked
 from fusion_gym.training.checkpoint import Journal, read_journal, restore
-from fusion_gym.training.config import EnvironmentConfig, Experiment
-from fusion_gym.training.diagnosis import Traffic, warn_of_silence, warn_of_unused_tokens
-from fusion_gym.training.monitor import Interrupt, Progress, Stop
+from fusion_gym.training.config import TABLE, EnvironmentConfig, Experiment, load_checked
+from fusion_gym.training.monitor import (
+    Interrupt,
+    Progress,
+    Stop,
+    Traffic,
+    warn_of_silence,
+    warn_of_unused_tokens,
+)
 from fusion_gym.validation import ConfigurationError, refusal
 
 

@@ -27,7 +27,7 @@ from fusion_gym.evaluation.rule_search import (
 )
 from fusion_gym.policies.base import Requests, Rule, shape_of
 from fusion_gym.policies.registry import make_policy, policy_maker, policy_names, search_ranges
-from fusion_gym.policies.rules.measurements import InnovationThreshold
+from fusion_gym.policies.rules import InnovationThreshold
 from fusion_gym.validation import ConfigurationError
 
 pytest.importorskip("cmaes")

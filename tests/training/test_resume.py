@@ -17,8 +17,7 @@ from training_configs import ENV, read_records, small_config
 import fusion_gym
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.training import run
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.validation import ConfigurationError
 
 SHORT = {"timesteps": 64, "num_envs": 4}

@@ -16,7 +16,7 @@ from test_unknown_input_plant import random_plant
 from fusion_gym import linalg
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.fusion.several import CovarianceIntersection, covariance_intersection_many
-from fusion_gym.policies.rules.measurements import AdaptiveThreshold
+from fusion_gym.policies.rules import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.filters import (
     BoundTables,
     InputModel,
