@@ -66,10 +66,8 @@ TrainingSeed = Annotated[int | None, whole(0, 2**32 - 1)]  # the limits of torch
 def check_options(values: Any) -> None:
     """Check every field of a command by its type, and that no output replaces an input."""
     declaration.check(values)
-    for name, hint in declaration.hints(type(values)).items():
-        marks = getattr(hint, "__metadata__", ())
-        if any(isinstance(mark, OutputFile) for mark in marks):
-            _refuse_input(values, name, getattr(values, name))
+    for name in declaration.marked(type(values), OutputFile):
+        _refuse_input(values, name, getattr(values, name))
 
 
 def _refuse_input(values: Any, option: str, path: Path | None) -> None:

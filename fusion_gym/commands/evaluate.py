@@ -111,9 +111,7 @@ class Evaluate(EnvironmentOptions, Long):
         earlier = steps * len(done["policies"].keys() & policies.keys())
         with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
             for part in ("policies", "quantiles"):
-                report[part] |= {
-                    name: done[part][name] for name in names if name in done["policies"]
-                }
+                report[part] |= {n: done[part][n] for n in names if n in done["policies"]}
             rest = [name for name in names if name not in done["policies"]]
             size = max(1, BATCH // self.episodes)
             for some in (rest[first : first + size] for first in range(0, len(rest), size)):

@@ -28,8 +28,7 @@ import numpy as np
 import tyro
 
 from fusion_gym.commands.command_line import OUTPUT_FOLDER, Long, between, whole
-from fusion_gym.commands.fit import plant_text
-from fusion_gym.commands.log_options import FitOptions, warn
+from fusion_gym.commands.fit import FitOptions, plant_text, warn
 from fusion_gym.entries import Options, Plain
 from fusion_gym.errors import forbidden
 from fusion_gym.output import files

@@ -23,7 +23,7 @@ from fusion_gym.entries import Arguments
 from fusion_gym.envs.drawing import Frame, Window
 from fusion_gym.envs.registration import make_task
 from fusion_gym.errors import forbidden
-from fusion_gym.evaluation.watching import watch
+from fusion_gym.evaluation.episodes import watch
 from fusion_gym.importing import require
 from fusion_gym.output.files import replacing
 from fusion_gym.output.progress import progress_bar, writing

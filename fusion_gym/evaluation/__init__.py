@@ -1,6 +1,12 @@
 """Evaluation: paired episodes, metrics with confidence intervals, the lower envelope."""
 
-from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
+from fusion_gym.evaluation.episodes import (
+    EpisodeResults,
+    Trajectory,
+    record_episode,
+    run_episodes,
+    watch,
+)
 from fusion_gym.evaluation.metrics import (
     EnvelopePoint,
     Interval,
@@ -11,7 +17,6 @@ from fusion_gym.evaluation.metrics import (
     robust_summary,
     summarise,
 )
-from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
 
 __all__ = [

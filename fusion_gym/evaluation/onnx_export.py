@@ -33,10 +33,8 @@ from fusion_gym.entries import Plain
 from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.importing import require
-from fusion_gym.policies.archive import POLICIES, algorithm_name
 from fusion_gym.policies.base import Policy, Requests
-from fusion_gym.policies.model import ModelPolicy
-from fusion_gym.policies.saved import CalibratedPolicy
+from fusion_gym.policies.saved import POLICIES, CalibratedPolicy, ModelPolicy, algorithm_name
 from fusion_gym.validation import ConfigurationError, refusal
 from fusion_gym.version import __version__
 
@@ -87,7 +85,8 @@ class DecisionGraph(torch.nn.Module):
         self._policy.eval()
         self._masked = isinstance(agent.model, MaskablePPO)
         self._recurrent = isinstance(agent.model, RecurrentPPO)
-        self._pairs = agent.pairs
+        # Each bit of an action has two outputs of the network, silence and a request.
+        self._pairs = self._masked or isinstance(action.space, spaces.MultiDiscrete)
         self._values = isinstance(policy, DQNPolicy)
         self._price = agent.price
         self._place = agent.view.names.index("price") if agent.price is not None else None
@@ -320,29 +319,6 @@ _CALLS, _WARM = 5000, 200  # measured calls, and calls before them
 Values = dict[str, NDArray[Any]]
 
 
-class Agreement(NamedTuple):
-    """The agreement of an ONNX graph with its agent.
-
-    Args:
-        observations: number of compared observations.
-        episodes: number of their episodes.
-        different: number of observations with another decision.
-        difference: greatest difference of the other outputs.
-        relative: greatest difference over 1 + the size of the output.
-    """
-
-    observations: int
-    episodes: int
-    different: int
-    difference: float
-    relative: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether all decisions agree, and all other outputs up to ``TOLERANCE``."""
-        return self.different == 0 and self.relative <= TOLERANCE
-
-
 class Latency(NamedTuple):
     """Seconds of one call with one row on one thread: ``median``, and ``most``, the 99 % point."""
 
@@ -358,36 +334,6 @@ def session(path: Path) -> Any:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def onnx_agreement(
-    agent: ModelPolicy,
-    graph: DecisionGraph,
-    path: Path,
-    task: Task,
-    observations: int = OBSERVATIONS,
-    seed: int = seeds.EXPORT.start,
-) -> Agreement:
-    """Compare the ONNX file at ``path`` with its agent in whole episodes.
-
-    Decisions are compared with the decisions of Stable-Baselines3, all other outputs with ``graph``
-    in torch.
-
-    Args:
-        agent: the agent.
-        graph: the graph of the file.
-        path: the ONNX file.
-        task: the task of the episodes.
-        observations: least number of observations, one row each.
-        seed: seed of the first episode.
-    """
-    rows = task.horizon * agent.view.rows_per_run
-    episodes = math.ceil(observations / rows)
-    comparison = _FileComparison(agent, graph, session(path))
-    run_episodes(task, comparison, episodes, seed)
-    return Agreement(
-        rows * episodes, episodes, comparison.different, comparison.difference, comparison.relative
-    )
-
-
 def latency(graph: DecisionGraph, path: Path) -> Latency:
     """Measure the time of one decision of the file at ``path``, over many calls in sequence."""
     run = session(path)
@@ -399,18 +345,41 @@ def latency(graph: DecisionGraph, path: Path) -> Latency:
     return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)))
 
 
-class _FileComparison:
-    """The agent as a policy that also runs the ONNX session on every observation."""
+class Agreement:
+    """The agent as a policy that compares an ONNX file with the agent on every observation.
 
-    def __init__(self, agent: ModelPolicy, graph: DecisionGraph, run: Any) -> None:
+    Decisions are compared with the decisions of Stable-Baselines3, all other outputs with ``graph``
+    in torch.
+
+    Args:
+        agent: the agent.
+        graph: the graph of the file.
+        path: the ONNX file.
+
+    Attributes:
+        observations: number of compared observations.
+        episodes: number of their episodes.
+        different: number of observations with another decision.
+        difference: greatest difference of the other outputs.
+        relative: greatest difference over 1 + the size of the output.
+    """
+
+    def __init__(self, agent: ModelPolicy, graph: DecisionGraph, path: Path) -> None:
         self.knowledge: Knowledge = agent.knowledge
         self.memory_owner = agent.memory_owner
-        self._agent, self._graph, self._session = agent, graph, run
+        self._agent, self._graph, self._session = agent, graph, session(path)
         self._columns = [agent.view.names.index(name) for name in graph.entries]
-        self.different, self.difference, self.relative = 0, 0.0, 0.0
+        self.observations, self.episodes, self.different = 0, 0, 0
+        self.difference, self.relative = 0.0, 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether all decisions agree, and all other outputs up to ``TOLERANCE``."""
+        return self.different == 0 and self.relative <= TOLERANCE
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Clear the memory."""
+        self.episodes += runs
         self._agent.reset(runs, seed)
         start = self._graph.example(runs * self._agent.view.rows_per_run)
         values = dict(zip(self._graph.inputs, (item.numpy() for item in start), strict=True))
@@ -428,6 +397,7 @@ class _FileComparison:
         required = self._run_torch(request | theirs)
         self._memories = [_following(result), _following(required)]
         requests = self._agent(signals)
+        self.observations += len(request["observation"])
         decided = requests != result["request"].reshape(requests.shape[1], -1).T
         self.different += int(decided.T.reshape(len(request["observation"]), -1).any(1).sum())
         for name in self._graph.outputs:
@@ -453,6 +423,28 @@ def _following(outputs: Values) -> Values:
         for name, value in outputs.items()
         if name.endswith("_next")
     }
+
+
+def onnx_agreement(
+    agent: ModelPolicy,
+    graph: DecisionGraph,
+    path: Path,
+    task: Task,
+    observations: int = OBSERVATIONS,
+) -> Agreement:
+    """Compare the ONNX file at ``path`` with its agent in whole episodes.
+
+    Args:
+        agent: the agent.
+        graph: the graph of the file.
+        path: the ONNX file.
+        task: the task of the episodes.
+        observations: least number of observations, one row each.
+    """
+    result = Agreement(agent, graph, path)
+    episodes = math.ceil(observations / (task.horizon * agent.view.rows_per_run))
+    run_episodes(task, result, episodes, seeds.EXPORT.start)
+    return result
 
 
 class Exported(NamedTuple):

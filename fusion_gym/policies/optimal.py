@@ -106,12 +106,8 @@ _cache: dict[bytes, tuple[Array, Array]] = {}
 def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
     """Return prices (P,) and the thresholds (P, S) at these prices."""
     key = pickle.dumps(replace(problem, price=0.0))
-    if key not in _cache:
-        _cache[key] = _solved(number, problem)
-    return _cache[key]
-
-
-def _solved(number: int, problem: SourceProblem) -> tuple[Array, Array]:
+    if key in _cache:
+        return _cache[key]
     if abs(problem.coefficient) > 1.0:
         raise validation.ConfigurationError(
             f"coefficient = {problem.coefficient:g} of source {number} is not allowed for the "
@@ -127,6 +123,7 @@ def _solved(number: int, problem: SourceProblem) -> tuple[Array, Array]:
         raise validation.ConfigurationError(
             f"source {number} is not allowed for the index: its thresholds must grow with the price"
         )
+    _cache[key] = prices, thresholds
     return prices, thresholds
 
 

@@ -24,7 +24,7 @@ from fusion_gym.commands.info import plain_text
 from fusion_gym.commands.list import catalogue
 from fusion_gym.commands.train import Train
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
-from fusion_gym.policies.archive import ALGORITHMS
+from fusion_gym.policies.saved import ALGORITHMS
 from fusion_gym.training.config import TABLE, Experiment, checked, config_path, load_checked
 
 PROGRAMS = {command_line.program_of(kind): kind for kind in map(load, EVERY)}

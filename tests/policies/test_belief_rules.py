@@ -14,7 +14,7 @@ from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.belief_rules import (
+from fusion_gym.policies.rules import (
     EstimateDifference,
     KullbackLeibler,
     ValueOfInformation,

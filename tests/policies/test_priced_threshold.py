@@ -12,8 +12,8 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.belief_rules import PricedThreshold, ValueOfInformation
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.rules import PricedThreshold, ValueOfInformation
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[Any]
