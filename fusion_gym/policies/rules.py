@@ -32,6 +32,7 @@ from fusion_gym.policies.base import (
     check_price,
     each_number,
     not_negative_parameter,
+    optional,
     parameter,
     shape_of,
     strongest,
@@ -935,12 +936,6 @@ def beliefs_of(signals: Signals, own: bool) -> Beliefs:
     return result
 
 
-def check_threshold(name: str, value: PerSensor | None) -> None:
-    """Check numbers >= 0, or None."""
-    if value is not None:
-        not_negative_parameter(name, value)
-
-
 @dataclass
 class ValueOfInformation(BeliefRule):
     r"""Request the sensors whose packet has a value of at least ``threshold``, or of its price.
@@ -982,7 +977,7 @@ class ValueOfInformation(BeliefRule):
     filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
-    threshold: PerSensor | None = parameter(None, check_threshold, THRESHOLD)
+    threshold: PerSensor | None = parameter(None, optional(not_negative_parameter), THRESHOLD)
     price: float | None = parameter(None, check_price)
     at_most: int | None = parameter(None, check_at_most)
     stateless: ClassVar[bool] = True
@@ -1054,18 +1049,15 @@ class EstimateDifference(BeliefRule):
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
         beliefs, age = self.beliefs(signals), signals["age"]
-        squared = _whitened(beliefs) if self.whitened else beliefs.loss
+        squared = beliefs.loss
+        if self.whitened:
+            difference, covariance = beliefs.difference, beliefs.silent.covariance
+            squared = linalg.dot(difference, linalg.solve_vector(covariance, difference))
         due = squared >= self.column("threshold", len(age)) ** 2
         requests = namespace(due).broadcast_to(due, age.shape)
         if self.own or self.at_most is None:
             return requests.copy()
         return strongest(beliefs.value, requests, self.at_most, age)
-
-
-def _whitened(beliefs: Beliefs) -> Array:
-    """Return (x* - x̂)ᵀ P⁻¹ (x* - x̂), with P the centre's covariance of x̂ (k, N)."""
-    difference, covariance = beliefs.difference, beliefs.silent.covariance
-    return linalg.dot(difference, linalg.solve_vector(covariance, difference))
 
 
 @dataclass
@@ -1141,7 +1133,7 @@ def _power(
 
 
 _SHARE = _power(0.1, 0.0, 1.0)
-_THRESHOLD = SearchRange(0.0, np.inf, deviation=0.15)
+_PRICED = SearchRange(0.0, np.inf, deviation=0.15)
 _MARGIN = SearchRange(1.0, float(np.exp(4.0)), per_sensor=False, deviation=0.15)
 
 
@@ -1199,7 +1191,7 @@ class PricedThreshold(BeliefRule):
     """
 
     score: Score = parameter("value", validation.choice, options=get_args(Score))
-    threshold: PerSensor = parameter(0.03, not_negative_parameter, _THRESHOLD)
+    threshold: PerSensor = parameter(0.03, not_negative_parameter, _PRICED)
     price_exponent: PerSensor = parameter(1.0, each_number, _power(0.075, -1.0, 4.0, True))
     price: float | None = parameter(None, check_price)
     reference_price: float = parameter(1.0, validation.number, above=0.0)

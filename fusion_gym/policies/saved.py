@@ -211,7 +211,7 @@ class ModelView:
             raise ConfigurationError("observation_names is not allowed: it must be a list of words")
         return cls(
             None if names is None else tuple(names),
-            validation.boolean("local", card_entry.get("local", False)),
+            boolean("local", card_entry.get("local", False)),
             None if span is None else Price.create("random", span).span,
             None if error is None else _errors(error),
         )
@@ -221,7 +221,7 @@ class ModelView:
         span = task.reward.price.span
         if None not in (self.price_range, span) and self.price_range != span:
             allowed = f"{display(self.price_range)}, which the agent observes, or left out"
-            raise validation.refusal("price_range", span, allowed)
+            raise refusal("price_range", span, allowed)
         if self.price_range is not None and span is None:
             task = task.with_options(cost_weight="random", price_range=self.price_range)
         error, own = self.nominal_error, task.nominal_error
@@ -229,7 +229,7 @@ class ModelView:
             return task
         if error is None or len(error) != len(own):
             allowed = f"{len(own)} numbers, because they scale its beliefs; train it again"
-            raise validation.refusal("nominal_error", error, allowed)
+            raise refusal("nominal_error", error, allowed)
         return replace(task, nominal_error=np.array(error))
 
 
@@ -247,9 +247,9 @@ class Blueprint:
         """Return the blueprint of the readable entries of Stable-Baselines3."""
         card_entry = _entry(data)
         if "format" in card_entry:
-            validation.integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
+            integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
             known = {"format", "algorithm", "reward_scale"} | ModelView.__dataclass_fields__.keys()
-            validation.keys("entry of the card", card_entry, known | _REPEATED)
+            keys("entry of the card", card_entry, known | _REPEATED)
         algorithm = algorithm_of(data)
         module = _table(data, "policy_class").get("__module__")
         if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
