@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     from fusion_gym import evaluation, jax, zoo
     from fusion_gym.core.estimator import Estimator, Reception
     from fusion_gym.core.knowledge import Block, Signal, age_block
-    from fusion_gym.core.options import CommonOptions, Scenario
     from fusion_gym.core.plant import Plant
-    from fusion_gym.core.task import Task
+    from fusion_gym.core.task import CommonOptions, Scenario, Task
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.privileged import make_sb3_vec_env
     from fusion_gym.envs.sb3 import FusionSB3VecEnv

@@ -22,9 +22,8 @@ from fusion_gym.core.jax_setup import jax
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.runs import Branch, Outcome, Position, advance, start_of
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.vector import step_infos
 from fusion_gym.envs.views import SchedulerView

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fusion_gym.core.options import CommonOptions
+from fusion_gym.core.task import CommonOptions
 from fusion_gym.declaration import choices, hints, meanings, plain_options, type_text
 
 

@@ -7,8 +7,7 @@ from fusion_gym.core.action import space_text
 from fusion_gym.core.knowledge import FEATURES, Block, covers, numbered
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import belief_blocks, block_entries, network_blocks
-from fusion_gym.core.options import CommonOptions
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import list_options, options_in, short
 from fusion_gym.envs.registration import make_task, options_of

@@ -17,9 +17,8 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec, parse_env_id
 
 from fusion_gym import validation
-from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.scale import rehearse, resolve
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.option_text import Option, list_options, options_in
 from fusion_gym.envs.returns import reward_threshold
@@ -95,9 +94,9 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
 
     Args:
         env_id: Id of the environment, such as ``"mine/Tank-v0"``.
-        build: Function from an options object to a :class:`~fusion_gym.core.options.Scenario`, or
+        build: Function from an options object to a :class:`~fusion_gym.core.task.Scenario`, or
             its ``"module:function"``, which worker processes can import. The annotation of its
-            argument is a dataclass that extends :class:`~fusion_gym.core.options.CommonOptions`.
+            argument is a dataclass that extends :class:`~fusion_gym.core.task.CommonOptions`.
 
     Raises:
         ConfigurationError: ``build`` is missing, or the id is already registered.

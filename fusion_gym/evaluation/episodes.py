@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signals
+from fusion_gym.core.memory import Beliefs, Owner
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Film, Frame

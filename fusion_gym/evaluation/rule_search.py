@@ -32,11 +32,11 @@ from numpy.typing import NDArray
 from fusion_gym import seeds, validation
 from fusion_gym.arrays import Array, arrays_of, map_arrays
 from fusion_gym.core.batch import draw_episodes
+from fusion_gym.core.compiled import RowStep
 from fusion_gym.core.knowledge import covers
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.rows import RowStep
 from fusion_gym.core.runs import Branch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_several

@@ -11,9 +11,18 @@ from numpy.typing import NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signal, Signals, covers, least_covering
+from fusion_gym.core.knowledge import (
+    KNOWLEDGE,
+    MEMORY_SIGNALS,
+    NETWORK_SIGNALS,
+    PLANNING_SIGNALS,
+    Knowledge,
+    Signal,
+    Signals,
+    covers,
+    least_covering,
+)
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.signals import MEMORY_SIGNALS, NETWORK_SIGNALS, PLANNING_SIGNALS
 from fusion_gym.core.task import Task
 from fusion_gym.namespace import namespace
 
@@ -30,7 +39,7 @@ class Policy(Protocol):
     they may be channels from 1, and 0 for silence. A run begins a new episode where
     ``signals["start"]`` is true.
 
-    A policy that uses beliefs (:mod:`fusion_gym.core.signals`) has an attribute ``memory_owner``,
+    A policy that uses beliefs (:mod:`fusion_gym.core.knowledge`) has an attribute ``memory_owner``,
     ``"scheduler"`` or ``"own"``, the owner of the beliefs. A policy that uses only the signals of
     the present step may have a true attribute ``stateless``; simulations may then call it inside an
     episode.

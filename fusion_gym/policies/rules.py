@@ -11,9 +11,8 @@ import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.knowledge import Knowledge, Signals
-from fusion_gym.core.memory import Owner
+from fusion_gym.core.memory import Beliefs, Estimate, Owner
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import SensorView
 from fusion_gym.errors import forbidden
@@ -942,7 +941,7 @@ class ValueOfInformation(BeliefRule):
 
     The value is v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖². x* is the best estimate, x̂ the centre's estimate
     without transmissions and x̂(s) its estimate after the packet of s only
-    (:mod:`fusion_gym.core.beliefs`). With memory x* uses all unsent measurements, without memory
+    (:mod:`fusion_gym.core.memory`). With memory x* uses all unsent measurements, without memory
     the measurements of this step. The norm has the weights of the reward, scaled to a mean of 1. In
     most settings this is the strongest rule, above all with memory.
 
@@ -971,7 +970,7 @@ class ValueOfInformation(BeliefRule):
 
     Assumes: x* is the conditional mean given the knowledge of its owner, and only this step counts.
 
-    Sources: :mod:`fusion_gym.core.beliefs` lists them.
+    Sources: :mod:`fusion_gym.core.memory` lists them.
 
     Example: ``value_of_information:threshold=0.03,at_most=1`` in ``fusion_gym/TobitOscillator-v1
     filter=tobit random_start=True token_rate=2 memory=True``.
@@ -1004,7 +1003,7 @@ class EstimateDifference(BeliefRule):
     r"""Request the sensors of the highest value when ‖x* - x̂‖ >= ``threshold``.
 
     x* is the best estimate and x̂ the centre's estimate without transmissions
-    (:mod:`fusion_gym.core.beliefs`). The norm has the weights of the reward, scaled to a mean of 1,
+    (:mod:`fusion_gym.core.memory`). The norm has the weights of the reward, scaled to a mean of 1,
     and the unit of the states. With ``own`` and without memory it is the change of the estimate by
     the sensor's own measurement.
 
@@ -1147,7 +1146,7 @@ class PricedThreshold(BeliefRule):
     Args:
         own: every sensor decides locally, by its memory and the broadcasts.
         score: v and l. ``"value"``: the expected value of a packet and the squared norm of x* - x̂
-            (:mod:`fusion_gym.core.beliefs`). ``"innovation"``: the squared norm of the innovation,
+            (:mod:`fusion_gym.core.memory`). ``"innovation"``: the squared norm of the innovation,
             v in predicted standard deviations, l in the unit of the measurement. ``"variance"``:
             the reduction of the fused trace by a packet, and the trace without packets, both
             predicted by the centre.

@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
-from fusion_gym.core.options import Scenario
+from fusion_gym.core.task import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.option_file import load_yaml
 from fusion_gym.systems.linear_plant import LinearPlant

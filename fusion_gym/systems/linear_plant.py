@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import true_motion
+from fusion_gym.core.plant import true_motion
 from fusion_gym.namespace import in_runs
 from fusion_gym.systems.schedule import MatrixSchedule, Scheduled
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import CommonOptions
+from fusion_gym.core.task import CommonOptions
 from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.namespace import namespace, take

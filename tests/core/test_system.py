@@ -12,9 +12,8 @@ from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.knowledge import Block, Signal
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.network import Network
-from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.plant import Plant
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.envs.registration import present_id
 from fusion_gym.validation import ConfigurationError
 

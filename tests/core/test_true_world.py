@@ -11,8 +11,7 @@ from scipy import stats
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
-from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.envs.registration import ENVIRONMENTS, make_task
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers.silence import silence_bound

@@ -16,8 +16,7 @@ from linear_case import Linear
 from refusals import refused
 
 from fusion_gym import ConfigurationError, make_task
-from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.errors import DivergenceError
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode, run_episodes

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.task import CommonOptions, Scenario
 from fusion_gym.systems.nonlinear import NonlinearSystem
 
 Array = NDArray[np.float64]

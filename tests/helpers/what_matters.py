@@ -17,10 +17,8 @@ import numpy as np
 
 from fusion_gym.arrays import merge_runs, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Estimate
-from fusion_gym.core.knowledge import Knowledge, Signals, covers
-from fusion_gym.core.memory import Memory
-from fusion_gym.core.signals import MEMORY_SIGNALS, NETWORK_SIGNALS
+from fusion_gym.core.knowledge import MEMORY_SIGNALS, NETWORK_SIGNALS, Knowledge, Signals, covers
+from fusion_gym.core.memory import Beliefs, Estimate, Memory
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, owner_of
 

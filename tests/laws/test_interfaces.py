@@ -23,8 +23,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.options import CommonOptions
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import CommonOptions, Task
 from fusion_gym.envs import registered
 from fusion_gym.envs.registration import class_name, options_of
 from fusion_gym.envs.single import FusionEnv

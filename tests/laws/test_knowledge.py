@@ -13,10 +13,9 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import SignalError, Signals, covers
-from fusion_gym.core.options import Broadcast
 from fusion_gym.core.plant import Plant
 from fusion_gym.core.runs import Outcome, Runs
-from fusion_gym.core.task import Task
+from fusion_gym.core.task import Broadcast, Task
 from fusion_gym.envs.registration import present_id
 from fusion_gym.envs.views import SensorView
 from fusion_gym.fusion.intersection import covariance_intersection

@@ -10,9 +10,9 @@ from scipy.stats import multivariate_normal
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Signals
+from fusion_gym.core.memory import Beliefs
 from fusion_gym.core.task import Task
 from fusion_gym.policies.rules import (
     EstimateDifference,

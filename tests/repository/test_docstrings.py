@@ -13,7 +13,7 @@ from paths import ROOT
 import fusion_gym
 from docs.tables import task_of
 from fusion_gym import evaluation, recordings
-from fusion_gym.core.options import CommonOptions
+from fusion_gym.core.task import CommonOptions
 from fusion_gym.docstrings import read
 from fusion_gym.envs import registration
 from fusion_gym.envs.option_text import options_in

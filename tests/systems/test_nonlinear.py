@@ -19,7 +19,7 @@ from paths import ROOT
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.task import CommonOptions, Scenario
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy

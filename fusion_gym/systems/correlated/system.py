@@ -16,7 +16,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.several import CovarianceIntersection

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.core.plant import Nature
 from fusion_gym.core.reward import equal_weights
+from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import true_motion
+from fusion_gym.core.plant import true_motion
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace, ndtr, take
 from fusion_gym.systems.linear_plant import covariance_factor, initial_law

@@ -26,7 +26,7 @@ from fusion_gym.core.knowledge import (
     numbered,
     sensed,
 )
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.namespace import namespace, take
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances, LagRecursion

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.core.plant import Nature
+from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import TokenBucket, Tokens
 from fusion_gym.declaration import NumpyOnly
 from fusion_gym.errors import forbidden

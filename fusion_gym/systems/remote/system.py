@@ -13,8 +13,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_motion, true_noise
-from fusion_gym.core.plant import Plant
+from fusion_gym.core.plant import AS_ASSUMED, Nature, Plant, true_motion, true_noise
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.parts import RANGE, Deliveries
 from fusion_gym.systems.silence import Silence

@@ -14,7 +14,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
-from fusion_gym.core.nature import Nature, true_motion, true_noise
+from fusion_gym.core.plant import Nature, true_motion, true_noise
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.parts import RANGE, Deliveries, NormalPlant, Truth, numbered_states

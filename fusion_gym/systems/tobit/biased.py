@@ -19,8 +19,8 @@ from scipy.linalg import block_diag
 
 from fusion_gym import validation
 from fusion_gym.core.access import AccessRule
-from fusion_gym.core.options import Scenario
 from fusion_gym.core.reward import equal_weights
+from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import Scenario
+from fusion_gym.core.task import Scenario
 from fusion_gym.declaration import NumpyOnly, plain_options
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states

@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.core.plant import Nature
+from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.declaration import plain_options
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import Scenario
+from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states, trigger_parameters

@@ -19,7 +19,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import Block, Signal, age_block, common_signals, numbered, sensed
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.namespace import namespace
 from fusion_gym.systems import parts
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss

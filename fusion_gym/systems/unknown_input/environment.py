@@ -18,8 +18,8 @@ from scipy.linalg import expm
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.admission import LARGEST_ERROR
-from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import PaperOptions, Scenario
+from fusion_gym.core.plant import Nature
+from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule

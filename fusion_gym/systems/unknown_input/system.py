@@ -14,7 +14,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.namespace import namespace, ndtr
 from fusion_gym.systems.linear_plant import largest_ratio
 from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
