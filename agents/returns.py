@@ -22,8 +22,7 @@ from agents.benchmark.rules import COUNT
 from agents.benchmark.settings import load_suite
 from agents.workers import Pool
 from fusion_gym import seeds
-from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.options import OUTPUT_FOLDER, whole
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Long, whole
 from fusion_gym.core.knowledge import covers
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain

@@ -24,8 +24,8 @@ from fusion_gym.errors import ConfigurationError
 from fusion_gym.evaluation.metrics import metric_table
 from fusion_gym.fusion.table import RULES
 from fusion_gym.policies import registry
-from fusion_gym.policies.settings import parse_settings
-from fusion_gym.training.algorithms import algorithm_table
+from fusion_gym.policies.registry import parse_settings
+from fusion_gym.training.config import algorithm_table
 
 # Interfaces by letter: a further option, and a policy that runs there.
 _INTERFACES = {

@@ -14,7 +14,7 @@ from agents.benchmark.jobs import Job
 from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output.progress import quietly
-from fusion_gym.policies.calibrated import CalibrationPoint
+from fusion_gym.policies.saved import CalibrationPoint
 from fusion_gym.training.calibration import calibrate
 
 

@@ -24,8 +24,7 @@ from agents.benchmark.jobs import Runner
 from agents.benchmark.report import print_classes, write_results
 from agents.benchmark.settings import ClassName, SuiteName, load_suite
 from agents.workers import BackendName, Pool
-from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.options import OUTPUT_FOLDER, whole, writable_folder
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Long, whole, writable_folder
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.files import lock_folder
 from fusion_gym.output.progress import writing

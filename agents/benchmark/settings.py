@@ -11,8 +11,15 @@ from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.rule_search import ClassName
 from fusion_gym.training import config
-from fusion_gym.training.algorithms import AnyAlgorithm
-from fusion_gym.training.checked import Positive, Rate, Share, Strict, checked, read_yaml
+from fusion_gym.training.config import (
+    AnyAlgorithm,
+    Positive,
+    Rate,
+    Share,
+    Strict,
+    checked,
+    read_yaml,
+)
 from fusion_gym.validation import choice
 
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)

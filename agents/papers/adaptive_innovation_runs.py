@@ -17,7 +17,7 @@ from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.runs import Outcome, State
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests, decide, surprise
-from fusion_gym.policies.rules.measurements import AdaptiveInnovation
+from fusion_gym.policies.rules import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 from fusion_gym.systems.correlated.filters import JointErrorCovariance
 from fusion_gym.systems.correlated.system import CorrelatedTrackingPlant, CorrelatedTrackingTruth

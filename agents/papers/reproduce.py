@@ -27,8 +27,7 @@ from agents.papers.paper import (
     load_papers,
 )
 from agents.workers import Call, Pool, run_parallel
-from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.options import OUTPUT_FOLDER, Seed, whole
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Long, Seed, whole
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.files import lock_folder, read_json
 from fusion_gym.output.progress import writing

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.options import Episodes, Seed
+from fusion_gym.commands.command_line import Episodes, Long, Seed
 from fusion_gym.docstrings import table
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -18,8 +17,7 @@ from fusion_gym.evaluation.metrics import mean_interval
 from fusion_gym.output import tables
 from fusion_gym.output.progress import progress_bar
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import SweepSettings
+from fusion_gym.training.config import SweepSettings, load_checked
 
 COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")
 

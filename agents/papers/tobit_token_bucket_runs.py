@@ -14,7 +14,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy
-from fusion_gym.policies.rules.measurements import DynamicEvent
+from fusion_gym.policies.rules import DynamicEvent
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 TRIGGER = "dynamic_event"

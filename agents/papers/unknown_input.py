@@ -20,7 +20,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.output import palette
-from fusion_gym.policies.rules.measurements import AdaptiveThreshold
+from fusion_gym.policies.rules import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
 from fusion_gym.systems.unknown_input.nodes import TableNodes
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator

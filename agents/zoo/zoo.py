@@ -18,8 +18,7 @@ from agents.benchmark.jobs import Runner
 from agents.benchmark.settings import Suite, knowledge_of, load_suite
 from agents.workers import Pool
 from fusion_gym import seeds, zoo
-from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.options import OUTPUT_FOLDER, whole
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Long, whole
 from fusion_gym.entries import Plain
 from fusion_gym.output.files import read_json, replacing, write
 from fusion_gym.output.progress import writing

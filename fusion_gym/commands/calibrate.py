@@ -19,13 +19,17 @@ from typing import Annotated
 from rich.table import Table
 
 from fusion_gym import zoo
-from fusion_gym.commands.command_line import EnvironmentOptions, Long, PolicyNames
-from fusion_gym.commands.options import OutputFile, whole
+from fusion_gym.commands.command_line import (
+    EnvironmentOptions,
+    Long,
+    OutputFile,
+    PolicyNames,
+    whole,
+)
 from fusion_gym.commands.search import token_prices
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output import tables
-from fusion_gym.policies.calibrated import agent_files
-from fusion_gym.policies.loading import model_file
+from fusion_gym.policies.saved import agent_files, model_file
 from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate
 from fusion_gym.validation import refusal
 

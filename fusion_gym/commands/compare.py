@@ -22,22 +22,20 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from fusion_gym.commands.command_line import Long
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Episodes, Long, Seed, whole
 from fusion_gym.commands.evaluate import evaluation_report
-from fusion_gym.commands.options import OUTPUT_FOLDER, Episodes, Seed, whole
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
 from fusion_gym.envs.registration import class_name, make_task
-from fusion_gym.evaluation import envelope
+from fusion_gym.evaluation import metrics
 from fusion_gym.evaluation.episodes import EpisodeResults, run_several
 from fusion_gym.output import figures, tables
 from fusion_gym.output.files import write
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy, policy_names, policy_parameters
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment, Sweep, SweepCurve
-from fusion_gym.training.diagnosis import warn_of_unused_tokens
+from fusion_gym.training.config import Experiment, Sweep, SweepCurve, load_checked
+from fusion_gym.training.run import warn_of_unused_tokens
 from fusion_gym.validation import refusal
 
 
@@ -75,9 +73,45 @@ class Compare(Long):
         for policy in requested:
             make_policy(policy, task)
         writing(("evaluation, comparison and figure", self.output))
-        rules = sweep.policies(task.reward.price)
-        baselines = run_all(task, rules, self.episodes, self.seed, "baselines")
-        return compare(world.id, task, sweep, baselines, requested, self.seed, self.output)
+        price, label = task.reward.price, _label(next(iter(requested)))
+        baselines = run_all(task, sweep.policies(price), self.episodes, self.seed, "baselines")
+        results = run_all(task, list(requested), self.episodes, self.seed, label)
+        points = [
+            Point(
+                name,
+                float(item.rate.mean()),
+                float(item.mse.mean()),
+                metrics.compare_at_price(item, baselines, requested[name]),
+                metrics.compare_with_envelope(item, baselines),
+            )
+            for name, item in results.items()
+        ]
+        report = evaluation_report(world.id, task, self.episodes, self.seed, baselines | results)
+        write(self.output / "evaluation.json", report)
+        write(self.output / "comparison.json", {"points": [point.plain() for point in points]})
+        if label.endswith("agent"):
+            warn_of_unused_tokens(task, float(next(iter(results.values())).tokens.mean()))
+        best = dict.fromkeys(point.at_price.best for point in points)
+        shown = dict.fromkeys([*sweep.points, *best, *results])
+        reports = {name: report["policies"][name] for name in shown}
+        title = f"single policies, the best of all {len(baselines)} baselines, and {label}"
+        title, console = f"{world.id}: {title}", tables.console()
+        console.print(tables.evaluation_table(title, reports, report["quantiles"], {}))
+        console.print(rate_table(points))
+        console.print(price_table(points, baselines))
+        rules = ", ".join(sorted({_rule(name) for name in best}))
+        least = [baselines[name] for name in best]
+        lines = [
+            figures.FigureLine(f"the best rule at each price: {rules}", least),
+            *other_curves(price, sweep, baselines, points),
+            figures.FigureLine(label, list(results.values())),
+        ]
+        name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", class_name(world.id)).capitalize()
+        sensors = f"{task.sensors} sensor{'s' * (task.sensors > 1)}"
+        title = f"{name}, {sensors}: {label} against the best rule at the same price"
+        costs = [point.at_price for point in points]
+        figures.pareto(self.output / "pareto.png", title, lines, costs)
+        return points
 
     def policies_of(self, task: Task) -> dict[str, float]:
         """Return the policy, or the policy at each price, with the price of a token."""
@@ -109,45 +143,6 @@ def run_all(
     return dict(zip(policies, results, strict=True))
 
 
-def compare(
-    env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
-    policies: Mapping[str, float], seed: int, folder: Path,
-) -> "list[Point]":  # fmt: skip
-    """Run the policy on the baselines' episodes, and write, print and draw the comparison."""
-    episodes, label = next(iter(baselines.values())).episodes, _label(next(iter(policies)))
-    results = run_all(task, list(policies), episodes, seed, label)
-    points = []
-    for name, item in results.items():
-        means = float(item.rate.mean()), float(item.mse.mean())
-        at_price = envelope.compare_at_price(item, baselines, policies[name])
-        points.append(
-            Point(name, *means, at_price, envelope.compare_with_envelope(item, baselines))
-        )
-    report = evaluation_report(env_id, task, episodes, seed, baselines | results)
-    write(folder / "evaluation.json", report)
-    write(folder / "comparison.json", {"points": [point.plain() for point in points]})
-    if label.endswith("agent"):
-        warn_of_unused_tokens(task, float(next(iter(results.values())).tokens.mean()))
-    best = dict.fromkeys(point.at_price.best for point in points)
-    console = tables.console()
-    title = f"{env_id}: single policies, the best of all {len(baselines)} baselines, and {label}"
-    reports = {n: report["policies"][n] for n in dict.fromkeys([*sweep.points, *best, *results])}
-    console.print(tables.evaluation_table(title, reports, report["quantiles"], {}))
-    console.print(rate_table(points))
-    console.print(price_table(points, baselines))
-    rules = ", ".join(sorted({_rule(name) for name in best}))
-    lines = [
-        figures.FigureLine(f"the best rule at each price: {rules}", [baselines[n] for n in best]),
-        *other_curves(task.reward.price, sweep, baselines, points),
-        figures.FigureLine(label, list(results.values())),
-    ]
-    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", class_name(env_id)).capitalize()
-    sensors = f"{task.sensors} sensor{'s' * (task.sensors > 1)}"
-    title = f"{name}, {sensors}: {label} against the best rule at the same price"
-    figures.pareto(folder / "pareto.png", title, lines, [point.at_price for point in points])
-    return points
-
-
 def other_curves(
     price: Price, sweep: Sweep, baselines: Mapping[str, EpisodeResults], points: Sequence["Point"]
 ) -> list[figures.FigureLine]:
@@ -174,8 +169,8 @@ class Point(NamedTuple):
     policy: str
     rate: float
     mse: float
-    at_price: envelope.PriceComparison
-    at_rate: envelope.BaselineComparison
+    at_price: metrics.PriceComparison
+    at_rate: metrics.BaselineComparison
 
     def plain(self) -> Plain:
         """Return the point as JSON."""
@@ -229,5 +224,5 @@ def rate_table(points: Sequence[Point]) -> Table:
     heads = "rate", "its MSE", "envelope's MSE", "difference [95 %]", "relative"
     title = f"at equal rate: {label}, and the baselines' lower envelope at the same rate"
     far = any(point.at_rate.far_apart for point in points)
-    note = f"* between baselines whose rates differ by more than {envelope.FAR_APART:g} times"
+    note = f"* between baselines whose rates differ by more than {metrics.FAR_APART:g} times"
     return tables.table_tables(title, ("envelope between", *heads), rows, note if far else None)

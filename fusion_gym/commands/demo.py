@@ -18,14 +18,12 @@ from typing import Annotated
 
 import numpy as np
 
-from fusion_gym.commands.command_line import Long
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Episodes, Long, Steps
 from fusion_gym.commands.compare import Compare, Point, run_all
-from fusion_gym.commands.options import OUTPUT_FOLDER, Episodes, Steps
 from fusion_gym.commands.train import Train
 from fusion_gym.envs.registration import make_task
 from fusion_gym.output.progress import remark
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.training.run import holds_training
 from fusion_gym.validation import ConfigurationError
 

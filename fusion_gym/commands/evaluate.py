@@ -15,8 +15,14 @@ from typing import Annotated
 
 import pydantic
 
-from fusion_gym.commands.command_line import EnvironmentOptions, Long, PolicyNames
-from fusion_gym.commands.options import Episodes, OutputFile, Seed
+from fusion_gym.commands.command_line import (
+    EnvironmentOptions,
+    Episodes,
+    Long,
+    OutputFile,
+    PolicyNames,
+    Seed,
+)
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments, Plain
 from fusion_gym.envs.registration import make_task
@@ -27,7 +33,7 @@ from fusion_gym.output.files import check_inputs, read_json, write
 from fusion_gym.output.progress import progress_bar, remark, writing
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.training.checked import checked
+from fusion_gym.training.config import checked
 from fusion_gym.validation import ConfigurationError, refusal
 
 _INPUTS = "env", "episodes", "seed", "horizon", "settings"
@@ -105,9 +111,7 @@ class Evaluate(EnvironmentOptions, Long):
         earlier = steps * len(done["policies"].keys() & policies.keys())
         with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
             for part in ("policies", "quantiles"):
-                report[part] |= {
-                    name: done[part][name] for name in names if name in done["policies"]
-                }
+                report[part] |= {n: done[part][n] for n in names if n in done["policies"]}
             rest = [name for name in names if name not in done["policies"]]
             size = max(1, BATCH // self.episodes)
             for some in (rest[first : first + size] for first in range(0, len(rest), size)):

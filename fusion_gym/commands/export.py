@@ -14,15 +14,13 @@ from typing import Annotated
 import tyro
 
 from fusion_gym import zoo
-from fusion_gym.commands.command_line import Command, EnvironmentOptions
-from fusion_gym.commands.options import OutputFile
+from fusion_gym.commands.command_line import Command, EnvironmentOptions, OutputFile
 from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.errors import forbidden
 from fusion_gym.importing import require
 from fusion_gym.output.files import replacing
-from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.settings import parse_settings
+from fusion_gym.policies.registry import make_policy, parse_settings
 from fusion_gym.validation import ConfigurationError, refusal
 
 _KINDS = ("zoo", "model")

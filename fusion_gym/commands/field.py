@@ -27,22 +27,20 @@ import joblib
 import numpy as np
 import tyro
 
-from fusion_gym.commands.command_line import Long
-from fusion_gym.commands.fit import plant_text
-from fusion_gym.commands.log_options import FitOptions, warn
-from fusion_gym.commands.options import OUTPUT_FOLDER, between, whole
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Long, between, whole
+from fusion_gym.commands.fit import FitOptions, plant_text, warn
 from fusion_gym.entries import Options, Plain
 from fusion_gym.errors import forbidden
 from fusion_gym.output import files
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.policies.settings import parse_settings, parse_value
+from fusion_gym.policies.registry import parse_settings, parse_value
 from fusion_gym.recordings import Recording, field_report, field_study, fit, fitting
 from fusion_gym.recordings.field_report import DeviceName, FieldReport
 from fusion_gym.recordings.field_study import METHODS, PRACTICE, FieldStudy, MethodPoint, scale
 from fusion_gym.recordings.recording import SHIPPED
 from fusion_gym.training import config
-from fusion_gym.training.algorithms import settings
+from fusion_gym.training.config import settings
 from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import ConfigurationError, number, refusal
 

@@ -8,22 +8,65 @@ rest, fitted to the first part. The table compares its errors with the real erro
 part, under a periodic schedule at five rates; errors are relative to a channel's variance.
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 import yaml
 
-from fusion_gym.commands.command_line import Command
-from fusion_gym.commands.log_options import FitOptions, warn
-from fusion_gym.commands.options import OutputFile
+from fusion_gym.commands.command_line import Command, OutputFile, between
 from fusion_gym.output.files import write_text
-from fusion_gym.output.progress import writing
+from fusion_gym.output.progress import remark, writing
 from fusion_gym.output.tables import console, table_tables
-from fusion_gym.recordings import FittedPlant, Recording, fit, fitting
-from fusion_gym.recordings.field_report import RATIOS, criticism_rows
 from fusion_gym.version import __version__
+
+if TYPE_CHECKING:
+    from fusion_gym.recordings import FittedPlant, Recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogOptions:
+    """Options that say how the file of a log is read."""
+
+    date_format: str | None = None
+    """Format of the times, such as %d/%m/%Y %H:%M; by default all rows decide."""
+    time_unit: Literal["s", "ms", "us", "ns", "min", "h", "d", "excel"] | None = None
+    """Unit of numeric times; by default their head names it."""
+    error_code: tuple[float, ...] = ()
+    """Values that are no readings, beside the recognised ones."""
+
+    @property
+    def reading(self) -> Mapping[str, Any]:
+        """Keyword arguments of ``Recording.read``."""
+        return {"date_format": self.date_format, "time_unit": self.time_unit,
+                "error_codes": self.error_code}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions(LogOptions):
+    """Options that say what a plant is fitted to."""
+
+    channels: tuple[str, ...] = ()
+    """Channels by name; by default all without a fault."""
+    share: Annotated[float, between(0.0, 0.95)] = 0.5
+    """Share of the log, from its start, for the fit."""
+    exact: bool = False
+    """The readings are the truth: fit no measurement noise."""
+    on_change: bool = False
+    """The log is recorded on change: a silent channel still has its last reading."""
+
+    def select(self, whole: "Recording") -> "Recording":
+        """Return the channels to fit."""
+        chosen = whole.select(self.channels, self.share)
+        return chosen.hold() if self.on_change else chosen
+
+
+def warn(lines: Iterable[str]) -> None:
+    """Print warnings of a log and its plant."""
+    for line in lines:
+        remark(f"warning: {line}")
 
 
 @dataclass(frozen=True)
@@ -37,6 +80,10 @@ class Fit(FitOptions, Command):
 
     def run(self) -> None:
         """Fit, criticise and write."""
+        # Imported here, because the command info takes the options above without a log.
+        from fusion_gym.recordings import Recording, fit, fitting
+        from fusion_gym.recordings.field_report import RATIOS, criticism_rows
+
         recording = self.select(Recording.read(self.log, **self.reading))
         plant = fit(recording, self.share, self.exact)
         values, rows = fitting.deviations(recording, self.share)
@@ -54,7 +101,7 @@ class Fit(FitOptions, Command):
         write_text(self.output, plant_text(plant, recording, self.log, rows))
 
 
-def plant_text(plant: FittedPlant, recording: Recording, log: str, rows: int) -> str:
+def plant_text(plant: "FittedPlant", recording: "Recording", log: str, rows: int) -> str:
     """Return the option file of a plant that was fitted to the first rows of a log."""
     source = f"# {Path(log).name}, the first {rows:,} steps of {recording.interval}"
     units = "; ".join(f"{c.name} [{c.unit}]" for c in recording.channels)

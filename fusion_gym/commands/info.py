@@ -19,13 +19,13 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markdown import Markdown, TableElement
 from rich.table import Table
 
-from fusion_gym.commands.command_line import Command
-from fusion_gym.commands.log_options import LogOptions
-from fusion_gym.commands.options import OutputFile
+from fusion_gym.commands.command_line import Command, OutputFile
+from fusion_gym.commands.fit import LogOptions
+from fusion_gym.commands.list import catalogue
 from fusion_gym.docstrings import plain_marks
 from fusion_gym.envs.registration import present_id
+from fusion_gym.output.progress import writing
 from fusion_gym.output.tables import console
-from fusion_gym.training.catalogue import catalogue
 from fusion_gym.validation import nearest, refusal
 
 
@@ -46,7 +46,7 @@ class Info(LogOptions, Command):
         names = [entry for named in entries.values() for entry in named]
         is_log = name in ("mast", "tanks") or ".csv" in Path(name).suffixes
         if name not in names and (is_log or Path(name).is_file()):
-            self.show(self.name, self.picture)
+            self.show_log()
             return
         picture = None if self.picture is None else str(self.picture)
         for option, value in {"picture": picture, **self.reading}.items():
@@ -58,6 +58,17 @@ class Info(LogOptions, Command):
         for kind, named in entries.items():
             if name in named:
                 print(plain_text(f"# {name} ({kind})\n\n{named[name].page()}", console()))
+
+    def show_log(self) -> None:
+        """Print the data card of a log, and draw its readings if there is a file for them."""
+        from fusion_gym.recordings import Recording, field_report
+
+        recording = Recording.read(self.name, **self.reading)
+        print("\n".join(field_report.card_lines(recording)))
+        console().print(field_report.card_table(recording))
+        if self.picture is not None:
+            writing(("picture", self.picture))
+            field_report.draw_card(recording, self.picture)
 
 
 _WORDS = {r"\\mathsf\s+T": "T", r"\\iff": " ⇔ ", r"\\(arg|det)": r"\1 ", r"\\Pr": "Pr"}

@@ -22,8 +22,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from fusion_gym.commands.command_line import EnvironmentOptions, Long
-from fusion_gym.commands.options import OUTPUT_FOLDER, whole
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, EnvironmentOptions, Long, whole
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options, Plain
 from fusion_gym.envs.registration import make_task
@@ -32,7 +31,7 @@ from fusion_gym.evaluation import rule_search
 from fusion_gym.output import tables
 from fusion_gym.output.files import check_inputs, folder_refusal, lock_folder, read_json, write
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.training.checked import checked
+from fusion_gym.training.config import checked
 from fusion_gym.validation import ConfigurationError
 
 _GENERATIONS, _RESULT = "generations.json", "search.json"

@@ -26,12 +26,17 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
-from fusion_gym.commands.command_line import Long, SetOptions
-from fusion_gym.commands.options import OUTPUT_FOLDER, Steps, TrainingSeed, writable_folder
+from fusion_gym.commands.command_line import (
+    OUTPUT_FOLDER,
+    Long,
+    SetOptions,
+    Steps,
+    TrainingSeed,
+    writable_folder,
+)
 from fusion_gym.errors import forbidden
-from fusion_gym.policies.settings import parse_settings
-from fusion_gym.training.checked import checked, load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.policies.registry import parse_settings
+from fusion_gym.training.config import Experiment, checked, load_checked
 from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import ConfigurationError
 

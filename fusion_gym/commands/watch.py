@@ -17,14 +17,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from fusion_gym.commands.command_line import EnvironmentOptions, Long
-from fusion_gym.commands.options import OutputFile, Seed, whole
+from fusion_gym.commands.command_line import EnvironmentOptions, Long, OutputFile, Seed, whole
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
 from fusion_gym.envs.drawing import Frame, Window
 from fusion_gym.envs.registration import make_task
 from fusion_gym.errors import forbidden
-from fusion_gym.evaluation.watching import watch
+from fusion_gym.evaluation.episodes import watch
 from fusion_gym.importing import require
 from fusion_gym.output.files import replacing
 from fusion_gym.output.progress import progress_bar, writing

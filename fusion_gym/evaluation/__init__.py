@@ -1,15 +1,22 @@
 """Evaluation: paired episodes, metrics with confidence intervals, the lower envelope."""
 
-from fusion_gym.evaluation.envelope import EnvelopePoint, compare_with_envelope, lower_envelope
-from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
+from fusion_gym.evaluation.episodes import (
+    EpisodeResults,
+    Trajectory,
+    record_episode,
+    run_episodes,
+    watch,
+)
 from fusion_gym.evaluation.metrics import (
+    EnvelopePoint,
     Interval,
+    compare_with_envelope,
+    lower_envelope,
     mean_interval,
     paired_difference,
     robust_summary,
     summarise,
 )
-from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
 
 __all__ = [

@@ -1,7 +1,7 @@
-"""Run policies over episodes whose noise is fixed by their seeds."""
+"""Run policies over episodes whose noise is fixed by their seeds, record and draw an episode."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import groupby
@@ -17,6 +17,8 @@ from fusion_gym.core.knowledge import KNOWLEDGE, Knowledge, Signals
 from fusion_gym.core.memory import Beliefs, Owner
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
+from fusion_gym.envs.drawing import Film, Frame
+from fusion_gym.errors import ConfigurationError
 from fusion_gym.fusion.diagonal import orthonormalise
 from fusion_gym.policies.base import Policy, Requests, decide, guard, owner_of
 
@@ -383,3 +385,91 @@ class _Part:
             raise AttributeError(name)
         vars(self)[name] = value = take_runs(getattr(self._whole, name), self._runs)
         return value
+
+
+_LETTERS = 90  # of a policy's name, above its picture
+
+
+class _Watched:
+    """A policy with its run; ``cost`` and ``tokens`` are sums over the steps so far."""
+
+    def __init__(self, name: str, policy: Policy, task: Task, seed: int, steps: int | None) -> None:
+        self.name, self.cost, self.tokens, self.steps = name, 0.0, 0.0, 0
+        self.batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
+        self.film = Film(task, 1, steps)
+        self.film.begin()
+        self.requests = decide(policy, self.batch, seed)
+
+    def step(self) -> None:
+        outcome = self.batch.step(next(self.requests))
+        self.film.record(self.batch, outcome)
+        self.cost -= float(outcome.reward.sum())
+        self.tokens += float(outcome.cost.sum())
+        self.steps += 1
+
+    def title(self) -> str:
+        """Return the name of the policy with its cost and tokens, means over the steps so far."""
+        name = self.name.replace("_", " ").replace(":", ": ", 1).replace(",", ", ")
+        name = name if len(name) <= _LETTERS else f"{name[: _LETTERS - 1]}…"
+        cost, tokens = self.cost / self.steps, self.tokens / self.steps
+        return f"{name}\ncost {cost:.3g} per step, tokens {tokens:.2f} per step (step {self.steps})"
+
+
+def watch(
+    task: Task, policies: Mapping[str, Policy], seed: int = 0, steps: int | None = None
+) -> Iterator[Frame]:
+    """Return pictures of one episode, one after each step.
+
+    All policies run on the same noise. Their pictures stand side by side and share their axes,
+    which a first run of the episode fixes, as it does the states that they show faintly. The cost
+    of a step is minus its reward.
+
+    Args:
+        task: the task.
+        policies: policies by the name above their picture.
+        seed: seed of the episode, >= 0.
+        steps: number of steps; the horizon by default.
+
+    Returns:
+        An iterator of pictures (height, width, 3).
+
+    Raises:
+        ConfigurationError: no policy, a negative seed, more steps than the horizon, or matplotlib
+            is missing; before the first picture.
+        LookupError: a policy uses a signal that the task withholds.
+
+    Example:
+        >>> from fusion_gym import make_policy, make_task
+        >>> from fusion_gym.evaluation import watch
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
+        >>> frames = watch(task, {"always": make_policy("always", task)}, steps=2)
+        >>> [frame.ndim for frame in frames]
+        [3, 3]
+    """
+    validation.integer("seed", seed, at_least=0)
+    if steps is not None:
+        validation.integer("steps", steps, at_least=1, at_most=task.horizon)
+    if not policies:
+        raise ConfigurationError("policies = {} is not allowed: it must name at least one")
+
+    def run() -> Iterator[list[_Watched]]:
+        """Yield the policies after each step of the episode."""
+        watched = [_Watched(*named, task, seed, steps) for named in policies.items()]
+        for _ in range(task.horizon if steps is None else steps):
+            for item in watched:
+                item.step()
+            yield watched
+
+    return _frames(run)
+
+
+def _frames(run: Callable[[], Iterator[list[_Watched]]]) -> Iterator[Frame]:
+    """Run the episode for the limits of its axes, and again for its pictures."""
+    ends, truth = [], []
+    for watched in run():
+        ends.append([item.film.limits() for item in watched])
+        truth.append(watched[0].film.truth())
+    low, high = np.min(ends, (0, 1))[:, 0].tolist(), np.max(ends, (0, 1))[:, 1].tolist()
+    words: Any = {"limits": list(zip(low, high, strict=True)), "truth": np.array(truth)}
+    for watched in run():
+        yield np.hstack([item.film.frame(title=item.title(), **words) for item in watched])

@@ -1,55 +1,322 @@
-"""Write an agent as an ONNX file, compare the file with the agent, and measure its latency."""
+"""Write a saved agent as an ONNX file, for sensors and schedulers without this library.
 
+The file has the agent's graph and, as metadata, its observation with names, scale and version, and
+its actions. Every value of the metadata is text; lists and tables are JSON, in which "inf" and
+"-inf" are infinite numbers. The file is compared with the agent, and its latency is measured.
+"""
+
+import hashlib
 import importlib
+import json
 import math
 import timeit
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.dqn.policies import DQNPolicy
 
 from fusion_gym import seeds
-from fusion_gym.core.knowledge import Knowledge, Signals
+from fusion_gym.core.action import space_text
+from fusion_gym.core.knowledge import MEANING, Block, Knowledge, Signals, numbered
+from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
+from fusion_gym.declaration import plain_options
+from fusion_gym.entries import Plain
+from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.importing import require
 from fusion_gym.policies.base import Policy, Requests
-from fusion_gym.policies.calibrated import CalibratedPolicy
-from fusion_gym.policies.model import ModelPolicy
-from fusion_gym.policies.onnx_card import onnx_card
-from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes, save_graph
+from fusion_gym.policies.saved import POLICIES, CalibratedPolicy, ModelPolicy, algorithm_name
 from fusion_gym.validation import ConfigurationError, refusal
+from fusion_gym.version import __version__
+
+OPSET = 17  # of ONNX 1.12, 2022: sufficient for these networks, and known to older runtimes
+Shapes = dict[str, tuple[str | int, ...]]  # by name; "batch" is the number of rows
+_CLOSED = -1e8  # MaskablePPO's logit of a masked choice
+
+
+class DecisionGraph(torch.nn.Module):
+    """The graph from rows of an observation to requests.
+
+    ``inputs`` and ``outputs`` are the names in their order, each with its shape. B is the number of
+    rows: one per run, or with a local view one per sensor and run. k sensors decide in a row:
+
+    - ``observation`` (B, entries) float32, clipped by the graph to the bounds of the layout;
+      ``entries`` are the names, without the price if the agent has a fixed price, which is a
+      constant of the graph.
+    - ``grantable`` (B, k) bool, the sensors that the network would grant; only for MaskablePPO.
+    - ``hidden`` and ``cell`` (layers, B, size) float32, zero at the start of an episode; only for
+      RecurrentPPO. Their next values are the outputs ``hidden_next`` and ``cell_next``.
+    - ``request`` (B, k) int8, the decision: 1 requests to transmit.
+    - ``probability`` (B, k) float32 of a request during learning, and the ``logits`` of the
+      distribution. DQN has the ``values`` of the choices instead.
+
+    Args:
+        agent: the agent.
+
+    Raises:
+        ConfigurationError: an agent that draws its actions, or whose policy is not supported.
+    """
+
+    def __init__(self, agent: ModelPolicy) -> None:
+        super().__init__()
+        policy: Any = agent.model.policy
+        if not agent.deterministic:
+            allowed = "True; the graph also returns the probability of every request"
+            raise refusal("deterministic", False, allowed, "here")
+        action = agent.view.action
+        if not action.bits and not isinstance(action.space, spaces.Discrete):
+            allowed = "another kind, because the graph requests without channels"
+            raise refusal("action", agent.task.options.action, allowed, "here")
+        if not isinstance(policy, tuple(POLICIES.values())):
+            raise ConfigurationError(
+                f"policy {type(policy).__name__} is not allowed here: it must be a policy of "
+                f"{', '.join(POLICIES)}"
+            )
+        self._policy: Any = agent.model.policy
+        self._policy.eval()
+        self._masked = isinstance(agent.model, MaskablePPO)
+        self._recurrent = isinstance(agent.model, RecurrentPPO)
+        # Each bit of an action has two outputs of the network, silence and a request.
+        self._pairs = self._masked or isinstance(action.space, spaces.MultiDiscrete)
+        self._values = isinstance(policy, DQNPolicy)
+        self._price = agent.price
+        self._place = agent.view.names.index("price") if agent.price is not None else None
+        stored = [place for place in range(len(agent.view.names)) if place != self._place]
+        self.entries = tuple(agent.view.names[place] for place in stored)
+        self.low: torch.Tensor
+        self.high: torch.Tensor
+        self.register_buffer("low", torch.as_tensor(agent.view.space.low[stored]))
+        self.register_buffer("high", torch.as_tensor(agent.view.space.high[stored]))
+        self.choices = _choices(agent)
+        self._table: torch.Tensor | None
+        table = None if self.choices is None else torch.as_tensor(self.choices, dtype=torch.float32)
+        self.register_buffer("_table", table)
+        sensors = agent.task.sensors if agent.view.rows_per_run == 1 else 1
+        self.inputs, self.outputs = self._named(sensors, policy)
+
+    def _named(self, sensors: int, policy: Any) -> tuple[Shapes, Shapes]:
+        """Return names and shapes of the inputs and outputs."""
+        inputs: Shapes = {"observation": ("batch", len(self.entries))}
+        outputs: Shapes = {"request": ("batch", sensors)}
+        if self._masked:
+            inputs["grantable"] = ("batch", sensors)
+        if self._values:
+            outputs["values"] = ("batch", policy.action_space.n)
+        else:
+            outputs["probability"] = ("batch", sensors)
+            outputs["logits"] = ("batch", policy.action_net.out_features)
+        if self._recurrent:
+            memory = (policy.lstm_actor.num_layers, "batch", policy.lstm_actor.hidden_size)
+            inputs |= {"hidden": memory, "cell": memory}
+            outputs |= {"hidden_next": memory, "cell_next": memory}
+        return inputs, outputs
+
+    def forward(self, observation: torch.Tensor, *more: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Return the outputs in their order, from the inputs in their order."""
+        rows = torch.minimum(torch.maximum(observation, self.low), self.high)
+        if self._price is not None:
+            price = torch.full_like(rows[:, :1], self._price)
+            rows = torch.cat((rows[:, : self._place], price, rows[:, self._place :]), dim=1)
+        if self._values:
+            values = self._policy.q_net(rows)
+            return self._taken(values), values
+        logits, memory = self._logits(rows, more)
+        probability = self._probability(logits, more[0] if self._masked else None)
+        if self._table is None:
+            marginal = probability
+            request = (probability > 0.5).to(torch.int8)
+        else:
+            marginal = probability @ self._table
+            request = self._taken(probability)
+        return request, marginal, logits, *memory
+
+    def _logits(
+        self, rows: torch.Tensor, more: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        policy: Any = self._policy
+        memory: tuple[torch.Tensor, ...] = ()
+        extractor = policy.pi_features_extractor
+        features: torch.Tensor = BasePolicy.extract_features(policy, rows, extractor)
+        if self._recurrent:
+            latent, memory = policy.lstm_actor(features.unsqueeze(0), (more[0], more[1]))
+            features = latent.squeeze(0)
+        return policy.action_net(policy.mlp_extractor.forward_actor(features)), memory
+
+    def _probability(self, logits: torch.Tensor, open_: torch.Tensor | None) -> torch.Tensor:
+        """Return the probability of each request (B, k), or with a table of each choice."""
+        if self._table is not None:
+            if open_ is not None:
+                closed = (1.0 - open_.to(logits.dtype)) @ self._table.T > 0.0
+                logits = torch.where(closed, torch.full_like(logits, _CLOSED), logits)
+            return torch.softmax(logits, dim=1)
+        if not self._pairs:
+            return torch.sigmoid(logits)
+        pairs = logits.reshape(-1, self._policy.action_net.out_features // 2, 2)
+        if open_ is not None:
+            both = torch.stack((torch.ones_like(open_), open_), dim=2)
+            pairs = torch.where(both, pairs, torch.full_like(pairs, _CLOSED))
+        return torch.softmax(pairs, dim=2)[..., 1]
+
+    def _taken(self, worth: torch.Tensor) -> torch.Tensor:
+        """Return the requests (B, k) of the best choice, the first among equals."""
+        assert self._table is not None
+        return self._table[worth.argmax(dim=1)].to(torch.int8)
+
+    def example(self, rows: int) -> tuple[torch.Tensor, ...]:
+        """Return inputs of so many rows, at the start of an episode."""
+        result = []
+        for name, shape in self.inputs.items():
+            sizes = [rows if size == "batch" else int(size) for size in shape]
+            kind = torch.bool if name == "grantable" else torch.float32
+            result.append((torch.ones if name == "grantable" else torch.zeros)(sizes, dtype=kind))
+        return tuple(result)
+
+
+def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
+    """Return the requests (choices, k) int8 of each discrete action; None for bits."""
+    action = agent.view.action
+    if not isinstance(action.space, spaces.Discrete):
+        return None
+    return (np.eye(2, 1, -1) if agent.view.local else action.table).astype(np.int8)
+
+
+def save_graph(graph: DecisionGraph, path: Path, received: Mapping[str, str]) -> None:
+    """Write the graph as an ONNX file, with ``received`` as its metadata."""
+    onnx: Any = importlib.import_module("onnx")
+    shapes = {**graph.inputs, **graph.outputs}
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch's older exporter, which needs no onnxscript
+        torch.onnx.export(
+            graph,
+            graph.example(2),
+            str(path),
+            input_names=list(graph.inputs),
+            output_names=list(graph.outputs),
+            dynamic_axes={name: {shape.index("batch"): "batch"} for name, shape in shapes.items()},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+    written = onnx.load(str(path))
+    written.graph.name = "fusion_gym"
+    onnx.helper.set_model_props(written, dict(received))
+    onnx.checker.check_model(written)
+    onnx.save(written, str(path))
+
+
+FORMAT = "1"
+_MEANINGS = {
+    "observation": "rows of the environment's observation, which the graph clips to their bounds",
+    "grantable": "sensors that the network would grant; the others do not request",
+    "hidden": "memory; zero at the start of an episode, then hidden_next",
+    "cell": "memory; zero at the start of an episode, then cell_next",
+    "request": "the decision: 1 requests to transmit",
+    "probability": "probability of a request if actions are drawn, as in training",
+    "logits": "logits of the distribution of actions",
+    "values": "learned value of each action",
+    "hidden_next": "memory for the next step",
+    "cell_next": "memory for the next step",
+}
+_TYPES = {"grantable": "bool", "request": "int8"}
+
+
+def onnx_card(
+    agent: ModelPolicy, graph: DecisionGraph, environment: str, model: str
+) -> dict[str, str]:
+    """Return the metadata of an agent's graph; ``model`` is the user's name of the agent."""
+    task, local = agent.task, isinstance(agent.view, SensorView)
+    layout = ObservationLayout(task, "own" if local else "scheduler")
+    names = list(graph.entries)
+    visible = {name.partition("[")[0] for name in names}
+    blocks = [_block(block, local) for block in layout.blocks if block.name in visible]
+    if local and task.options.own_number:
+        number = Block("sensor", "number of the sensor", np.array, (numbered(task.sensors),))
+        blocks.append(_block(number, local))
+    price = task.reward.price.span
+    values = {
+        "inputs": _ports(graph.inputs),
+        "outputs": _ports(graph.outputs),
+        "observation_names": names,
+        "observation_low": graph.low.tolist(),
+        "observation_high": graph.high.tolist(),
+        "observation_blocks": blocks,
+        "action": {
+            "space": space_text(agent.view.action.space),
+            "sensors": task.sensors,
+            "access": task.options.access,
+            "choices": None if graph.choices is None else graph.choices.tolist(),
+        },
+        "options": task.settings,
+        "price_range": price if agent.price is None else None,
+        "fixed_price": _fixed_price(agent),
+    }
+    words = {
+        "format": FORMAT,
+        "fusion_gym_version": __version__,
+        "model": model,
+        "algorithm": algorithm_name(agent.model),
+        "environment": environment,
+        "decides": "each sensor locally" if local else "a scheduler of all sensors",
+        "knows": MEANING[agent.knowledge],
+        "observation_version": layout_version(environment, names),
+    }
+    return words | {key: json.dumps(_finite(plain_options(value))) for key, value in values.items()}
+
+
+def layout_version(environment: str, names: list[str]) -> str:
+    """Return the id of the environment and a hash of the entries' names and order."""
+    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
+    return f"{environment}:{digest[:16]}"
+
+
+def _ports(shapes: Shapes) -> Plain:
+    rows = ((n, list(shape), _TYPES.get(n, "float32")) for n, shape in shapes.items())
+    return {n: {"shape": shape, "type": kind, "meaning": _MEANINGS[n]} for n, shape, kind in rows}
+
+
+def _block(block: Block, local: bool) -> Plain:
+    """Return a block of entries with the ``labels`` of its axes and its bounds."""
+    return {
+        "name": block.name,
+        "meaning": block.meaning,
+        "labels": [list(axis) for axis in block.labels],
+        "own_row": local and block.node == "own",
+        "bounds": list(block.bounds),
+        "constants": {key: np.asarray(value).tolist() for key, value in block.constants.items()},
+    }
+
+
+def _fixed_price(agent: ModelPolicy) -> float | None:
+    """Return the fixed price of a token of the agent, if it has one."""
+    span = agent.task.reward.price.span
+    if agent.price is None or span is None:
+        return None
+    low, high = span
+    return float(low * (high / low) ** agent.price)
+
+
+def _finite(value: Any) -> Any:
+    """Return the value with infinite numbers and nan as words."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
 
 OBSERVATIONS = 10_000
 TOLERANCE = 1e-4  # of numbers, relative to 1 + their size; float32 leaves about 1e-6
 _CALLS, _WARM = 5000, 200  # measured calls, and calls before them
 
 Values = dict[str, NDArray[Any]]
-
-
-class Agreement(NamedTuple):
-    """The agreement of an ONNX graph with its agent.
-
-    Args:
-        observations: number of compared observations.
-        episodes: number of their episodes.
-        different: number of observations with another decision.
-        difference: greatest difference of the other outputs.
-        relative: greatest difference over 1 + the size of the output.
-    """
-
-    observations: int
-    episodes: int
-    different: int
-    difference: float
-    relative: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether all decisions agree, and all other outputs up to ``TOLERANCE``."""
-        return self.different == 0 and self.relative <= TOLERANCE
 
 
 class Latency(NamedTuple):
@@ -67,36 +334,6 @@ def session(path: Path) -> Any:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def onnx_agreement(
-    agent: ModelPolicy,
-    graph: DecisionGraph,
-    path: Path,
-    task: Task,
-    observations: int = OBSERVATIONS,
-    seed: int = seeds.EXPORT.start,
-) -> Agreement:
-    """Compare the ONNX file at ``path`` with its agent in whole episodes.
-
-    Decisions are compared with the decisions of Stable-Baselines3, all other outputs with ``graph``
-    in torch.
-
-    Args:
-        agent: the agent.
-        graph: the graph of the file.
-        path: the ONNX file.
-        task: the task of the episodes.
-        observations: least number of observations, one row each.
-        seed: seed of the first episode.
-    """
-    rows = task.horizon * agent.view.rows_per_run
-    episodes = math.ceil(observations / rows)
-    comparison = _FileComparison(agent, graph, session(path))
-    run_episodes(task, comparison, episodes, seed)
-    return Agreement(
-        rows * episodes, episodes, comparison.different, comparison.difference, comparison.relative
-    )
-
-
 def latency(graph: DecisionGraph, path: Path) -> Latency:
     """Measure the time of one decision of the file at ``path``, over many calls in sequence."""
     run = session(path)
@@ -108,18 +345,41 @@ def latency(graph: DecisionGraph, path: Path) -> Latency:
     return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)))
 
 
-class _FileComparison:
-    """The agent as a policy that also runs the ONNX session on every observation."""
+class Agreement:
+    """The agent as a policy that compares an ONNX file with the agent on every observation.
 
-    def __init__(self, agent: ModelPolicy, graph: DecisionGraph, run: Any) -> None:
+    Decisions are compared with the decisions of Stable-Baselines3, all other outputs with ``graph``
+    in torch.
+
+    Args:
+        agent: the agent.
+        graph: the graph of the file.
+        path: the ONNX file.
+
+    Attributes:
+        observations: number of compared observations.
+        episodes: number of their episodes.
+        different: number of observations with another decision.
+        difference: greatest difference of the other outputs.
+        relative: greatest difference over 1 + the size of the output.
+    """
+
+    def __init__(self, agent: ModelPolicy, graph: DecisionGraph, path: Path) -> None:
         self.knowledge: Knowledge = agent.knowledge
         self.memory_owner = agent.memory_owner
-        self._agent, self._graph, self._session = agent, graph, run
+        self._agent, self._graph, self._session = agent, graph, session(path)
         self._columns = [agent.view.names.index(name) for name in graph.entries]
-        self.different, self.difference, self.relative = 0, 0.0, 0.0
+        self.observations, self.episodes, self.different = 0, 0, 0
+        self.difference, self.relative = 0.0, 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether all decisions agree, and all other outputs up to ``TOLERANCE``."""
+        return self.different == 0 and self.relative <= TOLERANCE
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Clear the memory."""
+        self.episodes += runs
         self._agent.reset(runs, seed)
         start = self._graph.example(runs * self._agent.view.rows_per_run)
         values = dict(zip(self._graph.inputs, (item.numpy() for item in start), strict=True))
@@ -137,6 +397,7 @@ class _FileComparison:
         required = self._run_torch(request | theirs)
         self._memories = [_following(result), _following(required)]
         requests = self._agent(signals)
+        self.observations += len(request["observation"])
         decided = requests != result["request"].reshape(requests.shape[1], -1).T
         self.different += int(decided.T.reshape(len(request["observation"]), -1).any(1).sum())
         for name in self._graph.outputs:
@@ -164,6 +425,28 @@ def _following(outputs: Values) -> Values:
     }
 
 
+def onnx_agreement(
+    agent: ModelPolicy,
+    graph: DecisionGraph,
+    path: Path,
+    task: Task,
+    observations: int = OBSERVATIONS,
+) -> Agreement:
+    """Compare the ONNX file at ``path`` with its agent in whole episodes.
+
+    Args:
+        agent: the agent.
+        graph: the graph of the file.
+        path: the ONNX file.
+        task: the task of the episodes.
+        observations: least number of observations, one row each.
+    """
+    result = Agreement(agent, graph, path)
+    episodes = math.ceil(observations / (task.horizon * agent.view.rows_per_run))
+    run_episodes(task, result, episodes, seeds.EXPORT.start)
+    return result
+
+
 class Exported(NamedTuple):
     """A written ONNX file.
 
@@ -187,9 +470,8 @@ def export_onnx(
 ) -> Exported:
     """Write an agent as an ONNX file, and check it.
 
-    The graph is :class:`~fusion_gym.policies.onnx_graph.DecisionGraph`; the metadata are
-    :func:`~fusion_gym.policies.onnx_card.onnx_card`. A file that decides otherwise than the agent
-    is removed.
+    The graph is :class:`DecisionGraph`; the metadata are :func:`onnx_card`. A file that decides
+    otherwise than the agent is removed.
 
     Args:
         agent: a saved agent that ``make_policy`` made for this task.

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fusion_gym.evaluation.envelope import PriceComparison
 from fusion_gym.evaluation.episodes import EpisodeResults
-from fusion_gym.evaluation.metrics import mean_interval
+from fusion_gym.evaluation.metrics import PriceComparison, mean_interval
 from fusion_gym.output.files import replacing
 from fusion_gym.output.palette import AGENT, BLUE, GREEN, PURPLE, SKY
 

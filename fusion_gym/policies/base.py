@@ -188,10 +188,18 @@ def parameter(
     return dataclasses.field(default=default, metadata={"check": check, "search": search})
 
 
-def check_interval(name: str, value: int | None) -> None:
-    """Check a largest number of steps: a whole number >= 1, or None for no limit."""
-    if value is not None:
-        validation.integer(name, value, at_least=1)
+def optional(check: Callable[..., Any], **limits: Any) -> Callable[[str, Any], None]:
+    """Return a check that also allows None."""
+
+    def checked(name: str, value: Any) -> None:
+        if value is not None:
+            check(name, value, **limits)
+
+    return checked
+
+
+check_at_most = optional(validation.integer, at_least=1, at_most=validation.MOST_SENSORS)
+check_price = optional(validation.number, at_least=0.0)
 
 
 class Stateless:
@@ -281,7 +289,7 @@ class LocalRule(Rule):
     """
 
     min_interval: int = parameter(1, validation.integer, INTERVAL, at_least=1)
-    max_interval: int | None = parameter(None, check_interval, INTERVAL)
+    max_interval: int | None = parameter(None, optional(validation.integer, at_least=1), INTERVAL)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -341,18 +349,6 @@ def each_number(name: str, value: Any, **limits: float) -> None:
     """Check one number or a sequence of numbers by :func:`validation.number`."""
     for entry in np.atleast_1d(np.asarray(value, dtype=object)):
         validation.number(name, entry, **limits)
-
-
-def check_at_most(name: str, value: int | None) -> None:
-    """Check the largest number of requests in a step: a whole number >= 1, or None for no limit."""
-    if value is not None:
-        validation.integer(name, value, at_least=1, at_most=validation.MOST_SENSORS)
-
-
-def check_price(name: str, value: float | None) -> None:
-    """Check a price or a threshold in its place: a number >= 0, or None."""
-    if value is not None:
-        validation.number(name, value, at_least=0.0)
 
 
 def shape_of(signals: Signals) -> tuple[int, int]:

@@ -5,11 +5,13 @@ names a saved agent, with settings after a comma. ``package.module:Class`` or
 ``package.module:Class:key=value`` names a class of the user.
 """
 
+import ast
+import contextlib
 import dataclasses
 import importlib
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
@@ -20,8 +22,38 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
 from fusion_gym.importing import TRUST, import_named
 from fusion_gym.policies.base import Policy, SearchRange, guard, owner_of
-from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys, refusal
+
+
+def parse_value(text: str) -> Any:
+    """Return the number, keyword, list or ``0.1/0.2/0.3`` of a text, or else the text."""
+    plain = {"true": True, "false": False, "none": None, "null": None}
+    if text.strip().lower() in plain:
+        return plain[text.strip().lower()]
+    if "/" in text:
+        parts = tuple(parse_value(part) for part in text.split("/"))
+        if all(isinstance(part, (int, float)) for part in parts):
+            return parts
+    for read in (ast.literal_eval, float):
+        # {[]: 1} raises a TypeError, too many brackets the last two.
+        with contextlib.suppress(ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+            return read(text)
+    return text
+
+
+def parse_settings(kind: str, entries: Iterable[str]) -> Arguments:
+    """Return ``["key=value", …]`` as a dictionary, with :func:`parse_value`."""
+    result: Arguments = {}
+    for entry in entries:
+        key, equals, value = entry.partition("=")
+        key = key.strip()
+        if not equals or not key:
+            raise ConfigurationError(f"{kind} {entry!r} is not allowed: write key=value")
+        if key in result:
+            raise ConfigurationError(f"{kind} {key!r} appears twice")
+        result[key] = parse_value(value)
+    return result
+
 
 Kind = Literal["rule", "reference", "agent"]
 Maker = Callable[..., Policy]
@@ -51,35 +83,35 @@ class PolicyRow(NamedTuple):
 
 _SHIPPED: dict[Kind, dict[str, str]] = {
     "rule": {
-        "adaptive_innovation": "rules.measurements:AdaptiveInnovation",
-        "adaptive_threshold": "rules.measurements:AdaptiveThreshold",
-        "always": "rules.schedules:Always",
-        "centre_variance": "rules.schedules:CentreVariance",
-        "dynamic_event": "rules.measurements:DynamicEvent",
-        "information_gain": "rules.schedules:InformationGain",
-        "innovation_threshold": "rules.measurements:InnovationThreshold",
-        "local_variance": "rules.schedules:LocalVariance",
-        "maximum_age": "rules.schedules:MaximumAge",
-        "never": "rules.schedules:Never",
-        "paced": "rules.schedules:Paced",
-        "periodic": "rules.schedules:Periodic",
-        "random": "rules.schedules:Random",
-        "report_on_change": "rules.measurements:ReportOnChange",
-        "round_robin": "rules.schedules:RoundRobin",
-        "send_on_delta": "rules.measurements:SendOnDelta",
-        "stochastic_event": "rules.measurements:StochasticEvent",
-        "variance_threshold": "rules.schedules:VarianceThreshold",
+        "adaptive_innovation": "rules:AdaptiveInnovation",
+        "adaptive_threshold": "rules:AdaptiveThreshold",
+        "always": "rules:Always",
+        "centre_variance": "rules:CentreVariance",
+        "dynamic_event": "rules:DynamicEvent",
+        "information_gain": "rules:InformationGain",
+        "innovation_threshold": "rules:InnovationThreshold",
+        "local_variance": "rules:LocalVariance",
+        "maximum_age": "rules:MaximumAge",
+        "never": "rules:Never",
+        "paced": "rules:Paced",
+        "periodic": "rules:Periodic",
+        "random": "rules:Random",
+        "report_on_change": "rules:ReportOnChange",
+        "round_robin": "rules:RoundRobin",
+        "send_on_delta": "rules:SendOnDelta",
+        "stochastic_event": "rules:StochasticEvent",
+        "variance_threshold": "rules:VarianceThreshold",
     },
     "reference": {
-        "age_index": "ages:AgeIndex",
-        "age_optimum": "ages:AgeOptimum",
-        "estimate_difference": "rules.beliefs:EstimateDifference",
-        "kullback_leibler": "rules.beliefs:KullbackLeibler",
+        "age_index": "optimal:AgeIndex",
+        "age_optimum": "optimal:AgeOptimum",
+        "estimate_difference": "rules:EstimateDifference",
+        "kullback_leibler": "rules:KullbackLeibler",
         "optimal": "optimal:OptimalPolicy",
         "periodic_optimum": "periodic_optimum:PeriodicOptimum",
-        "priced_threshold": "rules.priced_threshold:PricedThreshold",
+        "priced_threshold": "rules:PricedThreshold",
         "rollout": "rollout:Rollout",
-        "value_of_information": "rules.beliefs:ValueOfInformation",
+        "value_of_information": "rules:ValueOfInformation",
         "whittle": "optimal:WhittleIndex",
     },
     "agent": {"model": "saved:saved_agent", "zoo": "saved:zoo_agent"},
@@ -107,7 +139,7 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
 
     Example:
         >>> from fusion_gym import policy_names, register_policy
-        >>> from fusion_gym.policies.rules.schedules import Periodic
+        >>> from fusion_gym.policies.rules import Periodic
         >>> register_policy("clocked", Periodic)
         >>> "clocked" in policy_names("rule")
         True

@@ -14,8 +14,8 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Position, State, rank_requests
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, check_price, guard, owner_of
-from fusion_gym.policies.belief_rule import beliefs_of, check_owner, knows
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.rules import beliefs_of, check_owner, knows
 
 
 class Imagination:

@@ -19,9 +19,15 @@ from fusion_gym.evaluation.episodes import run_priced, seeded
 from fusion_gym.evaluation.rule_search import class_of, search_of_class
 from fusion_gym.output.files import replacing
 from fusion_gym.output.progress import progress_bar
-from fusion_gym.policies import calibrated
 from fusion_gym.policies.base import decide
-from fusion_gym.policies.loading import load_model_policy
+from fusion_gym.policies.saved import (
+    CalibratedPolicy,
+    CalibrationPoint,
+    Mixing,
+    calibration_rule,
+    load_model_policy,
+    save_calibrated,
+)
 
 MIXTURES = 0.0, 0.5, 1.0
 THRESHOLDS = -2.4, -0.8, -0.3, -0.1, 0.1, 0.3, 0.8
@@ -39,18 +45,18 @@ Candidate = tuple[int, float, float]  # agent, μ, c
 class CalibrationRow(NamedTuple):
     """A price: the chosen point, and costs on the tuning episodes of it, rule and best agent."""
 
-    point: calibrated.CalibrationPoint
+    point: CalibrationPoint
     cost: float
     rule_cost: float
     agent_cost: float
 
 
-class _Trial(calibrated.CalibratedPolicy):
+class _Trial(CalibratedPolicy):
     """A calibrated policy with a candidate for each run."""
 
-    candidates: calibrated.Mixing
+    candidates: Mixing
 
-    def at(self, price: Array) -> calibrated.Mixing:
+    def at(self, price: Array) -> Mixing:
         """Return the candidate of each run."""
         return self.candidates
 
@@ -84,7 +90,7 @@ def calibrate(
         name, count = class_of(task, agents[0].view.rows_per_run > 1), (first, max(1, last // 4))
         search = search_of_class(name, task, prices, episodes=count)
         rule = search.policy(search.first_point())
-    trial = _Trial(task, agents, (), calibrated.calibration_rule(rule, task), ())
+    trial = _Trial(task, agents, (), calibration_rule(rule, task), ())
     trial.slopes = fit_slopes(trial, prices, first)
     own = [(number, 0.0, 0.0) for number in range(len(agents))]
     grid = product(range(len(agents)), MIXTURES, THRESHOLDS)
@@ -98,13 +104,11 @@ def calibrate(
             rows.append(_choice(price, finalists, results, len(own)))
             bar.update()
     with replacing(output) as partial:
-        calibrated.save_calibrated(rule, trial.slopes, [row.point for row in rows], files, partial)
+        save_calibrated(rule, trial.slopes, [row.point for row in rows], files, partial)
     return rows
 
 
-def fit_slopes(
-    policy: calibrated.CalibratedPolicy, prices: Sequence[float], episodes: int
-) -> list[float]:
+def fit_slopes(policy: CalibratedPolicy, prices: Sequence[float], episodes: int) -> list[float]:
     """Return each agent's slope of its logit on z; without one, the ratio of deviations."""
     start, samples = seeds.CALIBRATION.start, []
     each = start + np.tile(np.arange(episodes), len(prices))
@@ -134,7 +138,7 @@ def _choice(
     difference = costs[best] - costs[0]
     error = difference.std(ddof=1) / np.sqrt(len(difference))
     chosen = best if difference.mean() + ERRORS * error < 0.0 else 0
-    point = calibrated.CalibrationPoint(float(price), *finalists[chosen])
+    point = CalibrationPoint(float(price), *finalists[chosen])
     return CalibrationRow(point, means[chosen], means[0], means[1 : 1 + agents].min())
 
 

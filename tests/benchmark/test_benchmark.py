@@ -24,8 +24,8 @@ from agents.benchmark.settings import CLASSES, knowledge_of, load_suite
 from agents.benchmark.verdict import cost_difference, discoveries, mean_difference
 from fusion_gym.core.knowledge import covers
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.calibrated import CalibrationPoint
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import CalibrationPoint
 
 SMALL = {
     "episodes": 20,

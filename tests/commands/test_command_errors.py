@@ -19,7 +19,7 @@ from paths import ROOT
 from fusion_gym.commands.command_line import Command
 from fusion_gym.core.reward import Price
 from fusion_gym.output.ending import report_errors
-from fusion_gym.policies.settings import parse_value
+from fusion_gym.policies.registry import parse_value
 from fusion_gym.training.config import SweepCurve
 from fusion_gym.validation import ConfigurationError
 

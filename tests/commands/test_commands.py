@@ -21,13 +21,11 @@ from agents.benchmark.command import Benchmark
 from fusion_gym.commands import __main__ as everything
 from fusion_gym.commands import command_line
 from fusion_gym.commands.info import plain_text
+from fusion_gym.commands.list import catalogue
 from fusion_gym.commands.train import Train
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
-from fusion_gym.policies.card import ALGORITHMS
-from fusion_gym.training.algorithms import TABLE
-from fusion_gym.training.catalogue import catalogue
-from fusion_gym.training.checked import checked, config_path, load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.policies.saved import ALGORITHMS
+from fusion_gym.training.config import TABLE, Experiment, checked, config_path, load_checked
 
 PROGRAMS = {command_line.program_of(kind): kind for kind in map(load, EVERY)}
 

@@ -16,7 +16,7 @@ from fusion_gym.commands import watch as command
 from fusion_gym.commands.watch import save_film
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.drawing import Film
-from fusion_gym.evaluation.watching import watch
+from fusion_gym.evaluation.episodes import watch
 from fusion_gym.policies.registry import make_policy
 
 TOBIT = "fusion_gym/TobitOscillator-v1"

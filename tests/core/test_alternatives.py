@@ -20,8 +20,7 @@ from fusion_gym.envs.privileged import (
     reference_estimator,
 )
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.training.run import make_env
 from fusion_gym.validation import ConfigurationError
 

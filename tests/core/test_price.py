@@ -45,7 +45,7 @@ def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
     from stable_baselines3 import PPO
 
     from fusion_gym.envs.sb3 import FusionSB3VecEnv
-    from fusion_gym.policies.model import ModelPolicy, tag_model
+    from fusion_gym.policies.saved import ModelPolicy, tag_model
 
     options = {"filter": "tobit", "cost_weight": "random", "price_range": SPAN}
     task = fusion_gym.make_task(ENV_ID, **options)

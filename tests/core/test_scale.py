@@ -13,8 +13,8 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.scale import nominal_rate
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import tag_model
 from fusion_gym.validation import ConfigurationError
 
 LINEAR = "fusion_gym/LinearFusion-v2"

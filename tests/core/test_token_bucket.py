@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.token_bucket import SharingRule, TokenBucket
-from fusion_gym.policies.rules.schedules import RoundRobin
+from fusion_gym.policies.rules import RoundRobin
 
 SHARING: tuple[SharingRule, ...] = get_args(SharingRule)
 PAPER = {"rate": 5.0, "capacity": 30.0, "initial": 10.0, "cost": 3.0, "sensors": 3}

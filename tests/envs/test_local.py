@@ -12,8 +12,8 @@ from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import tag_model
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"

@@ -13,8 +13,8 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import ModelPolicy, tag_model
 
 ENV_ID = "fusion_gym/TobitOscillator-v1"
 BIASED = "fusion_gym/BiasedOscillator-v1"

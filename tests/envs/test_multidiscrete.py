@@ -17,9 +17,7 @@ from fusion_gym.envs.pages import page
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run
-from fusion_gym.training.algorithms import TABLE
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import TABLE, Experiment, load_checked
 from fusion_gym.validation import ConfigurationError
 
 LINEAR = "fusion_gym/LinearFusion-v2"

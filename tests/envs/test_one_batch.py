@@ -15,8 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import fusion_gym
 from fusion_gym.envs.one_batch import one_batch
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v1"

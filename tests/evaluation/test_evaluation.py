@@ -19,10 +19,11 @@ from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.errors import DivergenceError
-from fusion_gym.evaluation.envelope import compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode, run_episodes
 from fusion_gym.evaluation.metrics import (
     METRICS,
+    compare_with_envelope,
+    lower_envelope,
     mean_interval,
     paired_difference,
     robust_summary,

@@ -10,8 +10,8 @@ from command_runs import call, refusal, succeed
 
 from fusion_gym.commands.compare import Point, _label, price_table, rate_table
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.envelope import compare_at_price, compare_with_envelope
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.metrics import compare_at_price, compare_with_envelope
 from fusion_gym.output import figures
 from fusion_gym.policies.registry import make_policy
 

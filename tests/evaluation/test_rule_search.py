@@ -12,13 +12,13 @@ from refusals import refused
 import fusion_gym
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation import rule_loop, rule_search
+from fusion_gym.evaluation import rule_search
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes, run_priced
-from fusion_gym.evaluation.rule_loop import make_loop
 from fusion_gym.evaluation.rule_search import (
     Generation,
     RuleSearch,
     ThresholdTrial,
+    make_loop,
     run_generations,
     search_of_class,
     search_result,
@@ -27,7 +27,7 @@ from fusion_gym.evaluation.rule_search import (
 )
 from fusion_gym.policies.base import Requests, Rule, shape_of
 from fusion_gym.policies.registry import make_policy, policy_maker, policy_names, search_ranges
-from fusion_gym.policies.rules.measurements import InnovationThreshold
+from fusion_gym.policies.rules import InnovationThreshold
 from fusion_gym.validation import ConfigurationError
 
 pytest.importorskip("cmaes")
@@ -205,7 +205,7 @@ def test_the_loop_in_machine_code_has_the_figures_of_numpy(
     for rule in every:
         values, trials = [0.01, 0.2, 1.5] if "rate" not in rule else [0.1, 0.3, 0.6], []
         for fewest in (10**9, 0):
-            monkeypatch.setattr(rule_loop, "_FEWEST", fewest)
+            monkeypatch.setattr(rule_search, "_FEWEST", fewest)
             try:
                 trials.append(try_thresholds(task, rule, values, 30, 7))
             except ConfigurationError:  # a rule of another environment
@@ -222,7 +222,7 @@ def test_a_search_in_machine_code_is_the_search_of_numpy(monkeypatch: pytest.Mon
     pytest.importorskip("llvmlite")
     results = []
     for fewest in (10**9, 0):
-        monkeypatch.setattr(rule_loop, "_FEWEST", fewest)
+        monkeypatch.setattr(rule_search, "_FEWEST", fewest)
         search = small()
         assert (search.loop is None) == (fewest > 0)
         results.append((every := list(run_generations(search)), search_result(search, every)))
@@ -269,8 +269,8 @@ class Sometimes(InnovationThreshold):
 def test_numpy_runs_what_the_loop_does_not(
     rule: str, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rule_loop, "_FEWEST", 0)
-    monkeypatch.setattr(rule_loop.RuleLoop, "costs", None)
+    monkeypatch.setattr(rule_search, "_FEWEST", 0)
+    monkeypatch.setattr(rule_search.RuleLoop, "costs", None)
     assert len(try_thresholds(task_of(**options), rule, [0.5, 1.0], 3, 0)) == 2
     alternating = [EveryOtherStep(number) for number in (1.0, 2.0)]
     assert rule_search._means(task_of(), alternating, 2, 0)[1] == pytest.approx(4.5)

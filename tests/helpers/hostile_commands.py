@@ -15,8 +15,7 @@ from agents.papers.reproduce import Reproduce
 from agents.papers.table import Table
 from agents.zoo.zoo import Zoo
 from fusion_gym.commands import __main__ as fusion_gym_commands
-from fusion_gym.commands.command_line import Command
-from fusion_gym.commands.options import OUTPUT_FOLDER, OutputFile
+from fusion_gym.commands.command_line import OUTPUT_FOLDER, Command, OutputFile
 
 RESEARCH: dict[str, type[Command]] = {
     "benchmark": Benchmark,

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.config import TABLE
 
 ENV = "fusion_gym/TobitOscillator-v1"
 _SIZES = {"n_steps": 16, "batch_size": 128, "n_epochs": 1, "memory": 8}

@@ -25,9 +25,7 @@ from fusion_gym.evaluation.metrics import METRICS
 from fusion_gym.output import figures
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run as train
-from fusion_gym.training.algorithms import TABLE
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment, Sweep, SweepSettings
+from fusion_gym.training.config import TABLE, Experiment, Sweep, SweepSettings, load_checked
 
 CONFIGS = ROOT / "configs"
 EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "\ntraining:" in f.read_text()]

@@ -16,8 +16,7 @@ from refusals import refused
 from benchmarks.newcomer import replaced, run
 from fusion_gym.commands.compare import Compare
 from fusion_gym.envs.registration import make_task
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.validation import ConfigurationError
 
 PAGE = (ROOT / "docs" / "newcomer.md").read_text()

@@ -19,10 +19,9 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.pages import page
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.loading import load_model_policy
-from fusion_gym.policies.model import ModelPolicy, tag_model
-from fusion_gym.policies.onnx_graph import DecisionGraph
+from fusion_gym.evaluation.onnx_export import DecisionGraph
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import ModelPolicy, load_model_policy, tag_model
 from fusion_gym.training.counterfactual import (
     CounterfactualMaskablePPO,
     CounterfactualPPO,

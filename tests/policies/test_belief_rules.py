@@ -14,7 +14,7 @@ from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Beliefs
 from fusion_gym.core.task import Task
-from fusion_gym.policies.rules.beliefs import (
+from fusion_gym.policies.rules import (
     EstimateDifference,
     KullbackLeibler,
     ValueOfInformation,

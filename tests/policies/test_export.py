@@ -22,13 +22,10 @@ from fusion_gym.commands.export import Export, export, spec
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.onnx_export import onnx_agreement
+from fusion_gym.evaluation.onnx_export import DecisionGraph, onnx_agreement, onnx_card, save_graph
 from fusion_gym.policies.base import owner_of
-from fusion_gym.policies.card import ModelView
-from fusion_gym.policies.model import ModelPolicy, tag_model
-from fusion_gym.policies.onnx_card import onnx_card
-from fusion_gym.policies.onnx_graph import DecisionGraph, save_graph
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import ModelPolicy, ModelView, tag_model
 from fusion_gym.validation import ConfigurationError
 
 

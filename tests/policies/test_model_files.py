@@ -29,9 +29,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.policies import archive
-from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import tag_model
 from fusion_gym.validation import ConfigurationError
 
 
@@ -362,7 +361,7 @@ def test_parts_larger_than_any_model_are_not_read(
     saved: Models, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent = saved("ppo")
-    monkeypatch.setattr(archive, "LARGEST", 10_000)
+    monkeypatch.setattr("fusion_gym.policies.saved.LARGEST", 10_000)
     refused_agent(agent.plain, agent.task, "its data has ", " bytes, more than 10000")
 
 

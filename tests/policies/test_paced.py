@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fusion_gym.policies.rules.schedules import Paced
+from fusion_gym.policies.rules import Paced
 
 LENGTH = 400
 

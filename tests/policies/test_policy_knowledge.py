@@ -32,8 +32,8 @@ from fusion_gym.docstrings import read
 from fusion_gym.evaluation import record_episode, run_episodes, watch
 from fusion_gym.evaluation.episodes import run_priced, run_several
 from fusion_gym.policies.base import Rule
-from fusion_gym.policies.belief_rule import BeliefRule
 from fusion_gym.policies.registry import make_policy, policy_maker, policy_names, register_policy
+from fusion_gym.policies.rules import BeliefRule
 from fusion_gym.validation import ConfigurationError
 
 ENVIRONMENTS: dict[str, tuple[str, Values]] = {

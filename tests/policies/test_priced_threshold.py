@@ -13,8 +13,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.beliefs import ValueOfInformation
-from fusion_gym.policies.rules.priced_threshold import PricedThreshold
+from fusion_gym.policies.rules import PricedThreshold, ValueOfInformation
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[Any]

@@ -14,8 +14,7 @@ from rules import make_rule
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import covers
-from fusion_gym.policies.registry import make_policy, policy_names
-from fusion_gym.policies.settings import parse_value
+from fusion_gym.policies.registry import make_policy, parse_value, policy_names
 
 ENV_ID = "fusion_gym/TobitOscillator-v1"
 SENSORS = 3

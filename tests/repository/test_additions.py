@@ -80,12 +80,12 @@ ADDITIONS = {
     "a rule": Addition(
         "assert fusion_gym.make_policy('old_news:steps=4', oscillator).steps == 4\n"
         "assert 'old_news' in fusion_gym.policy_names('rule')",
-        {"policies/rules/old_news.py": block("CONTRIBUTING.md", "class OldNews")},
+        {"policies/old_news.py": block("CONTRIBUTING.md", "class OldNews")},
         (
             (
                 "policies/registry.py",
-                '        "never": "rules.schedules:Never",',
-                '        "old_news": "rules.old_news:OldNews",',
+                '        "never": "rules:Never",',
+                '        "old_news": "old_news:OldNews",',
             ),
         ),
     ),

@@ -30,7 +30,7 @@ from fusion_gym.policies.registry import (
     policy_parameters,
 )
 from fusion_gym.recordings import FittedPlant, Recording, fit
-from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.config import TABLE
 
 POLICY_NAMES = [*policy_names("rule"), *policy_names("reference")]
 POLICIES = [policy_maker(name) for name in POLICY_NAMES]

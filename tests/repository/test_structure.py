@@ -110,7 +110,7 @@ def test_only_the_registration_knows_the_families_of_systems() -> None:
 
 def test_only_commands_of_logs_and_the_registration_know_recordings() -> None:
     """The registration has the name of their environment, and imports it on its first use."""
-    users = {f"fusion_gym.commands.{name}" for name in ("field", "fit", "log_options")}
+    users = {f"fusion_gym.commands.{name}" for name in ("field", "fit", "info")}
     users |= {"fusion_gym.envs.registration"}
     for module, path in modules().items():
         texts = {path.read_text(), *imports(module)}

@@ -61,8 +61,8 @@ READ = """
 import contextlib, io, json, os, sys
 from fusion_gym.commands.__main__ import load
 from fusion_gym.commands.command_line import read_command
-from fusion_gym.commands.options import check_options
-from fusion_gym.training.checked import config_path
+from fusion_gym.commands.command_line import check_options
+from fusion_gym.training.config import config_path
 from fusion_gym.validation import read_text
 for place, folder, (program, name, *words) in json.loads(sys.stdin.read()):
     os.chdir(folder)

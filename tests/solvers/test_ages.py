@@ -12,7 +12,7 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.ages import AgeIndex, AgeOptimum
+from fusion_gym.policies.optimal import AgeIndex, AgeOptimum
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers import AgeSource, SourceProblem, age_index, age_sources, solve_ages
 from fusion_gym.validation import ConfigurationError

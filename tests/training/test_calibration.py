@@ -17,19 +17,19 @@ from fusion_gym import seeds
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes, run_priced
-from fusion_gym.policies.calibrated import (
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.saved import (
     CalibratedPolicy,
     CalibrationPoint,
+    ModelPolicy,
+    ModelView,
     agent_files,
     save_calibrated,
+    tag_model,
 )
-from fusion_gym.policies.card import ModelView
-from fusion_gym.policies.model import ModelPolicy, tag_model
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run
 from fusion_gym.training.calibration import _choice, calibrate, fit_slopes
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.training.run import train
 from fusion_gym.validation import ConfigurationError
 

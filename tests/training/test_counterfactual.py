@@ -14,9 +14,7 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run
-from fusion_gym.training.algorithms import TABLE
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import TABLE, Experiment, load_checked
 from fusion_gym.training.counterfactual import CounterfactualPPO, Decisions, _Step
 from fusion_gym.validation import ConfigurationError
 

@@ -12,9 +12,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from fusion_gym import ConfigurationError
-from fusion_gym.training.algorithms import TABLE
-from fusion_gym.training.checked import checked, load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import TABLE, Experiment, checked, load_checked
 from fusion_gym.training.run import check_run
 
 Content = dict[str, Any]

@@ -8,8 +8,7 @@ import torch
 
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.training.checked import checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, checked
 from fusion_gym.training.run import make_model
 from fusion_gym.validation import ConfigurationError
 

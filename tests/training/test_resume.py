@@ -17,8 +17,7 @@ from training_configs import ENV, read_records, small_config
 import fusion_gym
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.training import run
-from fusion_gym.training.checked import load_checked
-from fusion_gym.training.config import Experiment
+from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.validation import ConfigurationError
 
 SHORT = {"timesteps": 64, "num_envs": 4}
@@ -139,7 +138,7 @@ def test_the_best_model_outlives_a_kill_between_its_validation_and_the_checkpoin
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=512)
     folder = Path(experiment.output)
     with monkeypatch.context() as patch:
-        patch.setattr("fusion_gym.training.monitor.Progress._write_records", die_with_records(2))
+        patch.setattr("fusion_gym.training.run.Progress._write_records", die_with_records(2))
         with pytest.raises(Killed):
             run.train(experiment, quiet=True)
     assert (folder / "best_model.zip").exists()
@@ -194,7 +193,7 @@ def test_two_trainings_in_one_folder_are_refused(
             tried.append(str(caught.value))
         return ""
 
-    monkeypatch.setattr("fusion_gym.training.monitor.log_line", log_line)
+    monkeypatch.setattr("fusion_gym.training.run.log_line", log_line)
     run.train(experiment, quiet=True)
     assert len(tried) == 2
 

@@ -11,8 +11,7 @@ from rules import make_rule
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.rules.measurements import AdaptiveInnovation
-from fusion_gym.policies.rules.schedules import Random
+from fusion_gym.policies.rules import AdaptiveInnovation, Random
 from fusion_gym.validation import ConfigurationError
 
 build = partial(make_task, "fusion_gym/CorrelatedTracking-v1")

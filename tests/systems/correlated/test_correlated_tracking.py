@@ -21,7 +21,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.base import Policy
-from fusion_gym.policies.rules.measurements import AdaptiveInnovation
+from fusion_gym.policies.rules import AdaptiveInnovation
 
 build = partial(make_task, "fusion_gym/CorrelatedTracking-v1")
 

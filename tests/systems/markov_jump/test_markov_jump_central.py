@@ -21,7 +21,7 @@ from fusion_gym.core.knowledge import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.schedules import Always, Random
+from fusion_gym.policies.rules import Always, Random
 from fusion_gym.validation import ConfigurationError
 
 build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")

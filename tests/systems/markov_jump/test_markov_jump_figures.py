@@ -22,7 +22,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.schedules import CentreVariance, LocalVariance, Random
+from fusion_gym.policies.rules import CentreVariance, LocalVariance, Random
 
 build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")
 

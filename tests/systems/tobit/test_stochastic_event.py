@@ -12,7 +12,7 @@ from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.rules.measurements import StochasticEvent
+from fusion_gym.policies.rules import StochasticEvent
 from fusion_gym.systems.tobit.filters import StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 

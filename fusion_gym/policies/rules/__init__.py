@@ -1,1 +1,0 @@
-"""Trigger rules from signals to requests, one rule or pair of rules per module."""
