@@ -126,20 +126,29 @@ def marked(kind: type, mark: type[MarkT]) -> dict[str, MarkT]:
 
 def check(options: Any) -> None:
     """Check what is declared as ``Literal``, ``bool``, a name of a table, or with a mark."""
-    for name, hint in _hints_of(options.__class__).items():
-        value, parts = getattr(options, name), _parts(hint)
-        if value is None and NoneType in parts:
-            continue
-        checks = [mark for mark in _metadata(hint) if isinstance(mark, Mark)]
-        for mark in checks:
-            for entry in value if isinstance(value, tuple) else (value,):
-                mark(name, entry)
-        if checks or not all(isinstance(table, Mapping) for table in _tables(hint)):
-            continue
-        if allowed := choices(hint):
-            validation.choice(name, value, allowed)
-        elif set(parts) <= {bool, NoneType}:
-            validation.boolean(name, value)
+    for name, optional, checks in _checks(options.__class__):
+        value = getattr(options, name)
+        for own in () if value is None and optional else checks:
+            several = isinstance(own, Mark) and isinstance(value, tuple)
+            for entry in value if several else (value,):
+                own(name, entry)
+
+
+@functools.cache
+def _checks(kind: type) -> list[tuple[str, bool, list[Any]]]:
+    """Return the fields with checks, whether each may be ``None``, and the checks."""
+    result = []
+    for name, hint in _hints_of(kind).items():
+        parts, tables = _parts(hint), _tables(hint)
+        checks: list[Any] = [mark for mark in _metadata(hint) if isinstance(mark, Mark)]
+        if not checks and all(isinstance(table, Mapping) for table in tables):
+            if allowed := tables[0] if tables else choices(hint):
+                checks = [functools.partial(validation.choice, options=allowed)]
+            elif set(parts) <= {bool, NoneType}:
+                checks = [validation.boolean]
+        if checks:
+            result.append((name, NoneType in parts, checks))
+    return result
 
 
 def _metadata(hint: Any) -> tuple[Any, ...]:
