@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -251,18 +251,12 @@ class NonlinearEstimator(parts.AdoptingEstimator[FilteredEstimate]):
         runs, system = measurement.shape[-1], self.system
         mean = np.repeat(system.initial_mean[:, None], runs, axis=1)
         covariance = np.repeat(system.initial_covariance[..., None], runs, axis=-1)
-        age = np.zeros((system.sensors, runs))
-        return FilteredEstimate(measurement, measurement, age, mean, covariance, mean, covariance)
+        return FilteredEstimate.begin(measurement, mean, covariance, mean, covariance)
 
     def predict(self, state: FilteredEstimate) -> FilteredEstimate:
         """Predict."""
         mean, covariance = self.system.predict(state.mean, state.covariance)
-        return replace(
-            state,
-            age=state.age + 1.0,
-            prior_mean=mean,
-            prior_covariance=linalg.symmetrise(covariance),
-        )
+        return state.later(prior_mean=mean, prior_covariance=linalg.symmetrise(covariance))
 
     def update(self, state: FilteredEstimate, reception: Reception) -> FilteredEstimate:
         """Update the centre with the measurements that arrive, sensor by sensor."""

@@ -250,22 +250,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         noise_mean = np.zeros((count, plant.process_gain.shape[1], runs))
         state_mean = np.broadcast_to(plant.initial_mean, (n, runs)).copy()
         covariance = np.broadcast_to(plant.initial_covariance, (n, n, runs)).copy()
+        nodes, fused = (mean, noise_mean), (state_mean, covariance)
+        time, nothing = np.zeros(runs, dtype=np.int64), np.zeros((count, runs))
+        held, lags = self._collapse(mean), self.recursion.start(runs)
         return MarkovJumpEstimate(
-            time=np.zeros(runs, dtype=np.int64),
-            measurement=measurement,
-            innovation=np.zeros((count, runs)),
-            node_mean=mean,
-            node_noise=noise_mean,
-            copy_mean=mean,
-            copy_noise=noise_mean,
-            held=self._collapse(mean),
-            age=np.zeros((count, runs)),
-            lags=self.recursion.start(runs),
-            prediction=None,
-            prior_mean=state_mean,
-            prior_covariance=covariance,
-            mean=state_mean,
-            covariance=covariance,
+            measurement, held, nothing, time, nothing, *nodes, *nodes, lags, None, *fused, *fused
         )
 
     def predict(self, state: MarkovJumpEstimate) -> MarkovJumpEstimate:
@@ -280,15 +269,13 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         prediction = self.recursion.prediction(lags, place)
         silence = np.zeros(state.age.shape, dtype=np.bool_)
         silent = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(silence))
-        return replace(
-            state,
+        return state.later(
             time=time,
             innovation=np.zeros(state.innovation.shape),
             node_mean=self.filters.predict(state.node_mean, state.node_noise, before),
             node_noise=np.zeros(state.node_noise.shape),
             copy_mean=copy_mean,
             copy_noise=np.zeros(state.copy_noise.shape),
-            age=state.age + 1.0,
             lags=lags,
             prediction=prediction,
             prior_mean=silent.mean,

@@ -190,12 +190,8 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
     def predict(self, state: RemoteEstimate) -> RemoteEstimate:
         """Predict the sources."""
         a, sigma = self.model.coefficient[:, None], self.model.deviation[:, None]
-        return replace(
-            state,
-            prior=a * state.mean,
-            prior_variance=a * a * state.variance + sigma * sigma,
-            age=state.age + 1.0,
-        )
+        variance = a * a * state.variance + sigma * sigma
+        return state.later(prior=a * state.mean, prior_variance=variance)
 
     def update(self, state: RemoteEstimate, reception: Reception) -> RemoteEstimate:
         """Replace the centre's prediction where a packet arrives."""

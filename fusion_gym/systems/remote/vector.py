@@ -328,9 +328,7 @@ class VectorEstimator(Estimator[VectorEstimate]):
     def predict(self, state: VectorEstimate) -> VectorEstimate:
         """Predict at the nodes and at the centre."""
         transition = self.model.transition
-        return replace(
-            state,
-            age=state.age + 1.0,
+        return state.later(
             node_mean=linalg.matvec(transition, state.node_mean),
             prior=linalg.matvec(transition, state.mean),
             prior_blocks=self.model.predict_covariance(state.blocks),

@@ -20,7 +20,7 @@ from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states, trigger_parameters
-from fusion_gym.systems.tobit import system
+from fusion_gym.systems.tobit import centres, system
 from fusion_gym.systems.tobit.filters import (
     BoundConstants,
     BoundTobitFilter,
@@ -36,12 +36,12 @@ _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
 _HELD = "the silent filter continues from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
-    "paper": system.Filter(
+    "paper": centres.Filter(
         BoundTobitFilter,
-        lambda options, sensors: system.feedback_centre(options, _bound_filter(options, sensors)),
+        lambda options, sensors: centres.feedback_centre(options, _bound_filter(options, sensors)),
     ),
-    "tobit": system.at_the_nodes(TobitKalmanFilter),
-    **system.FILTERS,
+    "tobit": centres.at_the_nodes(TobitKalmanFilter),
+    **centres.FILTERS,
 }
 
 
@@ -72,7 +72,7 @@ class TobitOscillatorOptions(system.FeedbackOptions):
         (3, ('x1', 'x2'))
     """
 
-    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = centres.classes(_FILTERS)
     transition: ArrayLike = ((_COS, _SIN), (-_SIN, _COS))
     """A of equation (1), (n, n). By default a rotation by 0.052 π."""
     process_noise: Literal["scalar", "full"] = "scalar"
@@ -139,21 +139,15 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
                 f"{name} = {refused!r} is not allowed with filter={options.filter!r}: it belongs "
                 "to filter='paper' (the others predict in silence, without an event error)"
             )
-    memory_filter = options.memory_filter
-    if memory_filter is None and options.filter == "paper":
-        # The paper's minimises a bound; with every measurement it errs thrice.
-        memory_filter = "adf"
     holds = options.filter == "paper" and options.silent != "predict"
     return system.feedback_scenario(
         options,
         _FILTERS,
-        plant,
-        sensors,
-        numbered_states(plant.size),
+        system.CensoredPlant(plant, sensors, numbered_states(plant.size), options.random_start),
         horizon,
-        memory_filter=memory_filter,
+        # The paper's minimises a bound; with every measurement it errs thrice.
+        memory_filter="adf" if options.filter == "paper" else None,
         policy_defaults={"dynamic_event": trigger},
-        random_start=options.random_start,
         no_estimates=_HELD if holds else None,
     )
 

@@ -26,13 +26,10 @@ from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.unknown_input import filters
 from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
 from fusion_gym.systems.unknown_input.plant import (
-    ArrayInput,
+    SHAPE,
     InputSensors,
-    InputSignal,
-    MeanRevertingWalk,
-    Sinusoids,
-    Steps,
     UnknownInputPlant,
+    make_signal,
 )
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 
@@ -122,7 +119,6 @@ EXAMPLES = _examples()
 
 
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
-_SHAPE = ("input_amplitude", "input_period", "input_phase")  # of a signal by its name
 Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
@@ -234,7 +230,7 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
     options = _with_example(choice)
     horizon = validation.horizon(options.horizon)
     plant = UnknownInputPlant.create(options)
-    signal = _signal(options, plant.inputs, horizon)
+    signal = make_signal(options, plant.inputs, horizon)
     sensors = InputSensors.create(options, plant)
     trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
@@ -316,30 +312,11 @@ def _with_example(options: UnknownInputOptions) -> Any:
     kind = options.input_signal
     if isinstance(kind, str):
         validation.choice("input_signal", kind, get_args(Signal))
-        numbers |= zip(_SHAPE, example["signals"][kind], strict=True)
+        numbers |= zip(SHAPE, example["signals"][kind], strict=True)
     if options.transition is not None or options.initial_mean is not None:
         numbers.pop("initial_half_width", None)
     missing = {name: value for name, value in numbers.items() if getattr(options, name) is None}
     return replace(options, **missing)
-
-
-def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
-    kind = options.input_signal
-    shape = {name: getattr(options, name) for name in _SHAPE}
-    if not isinstance(kind, str):
-        for name, value in shape.items():
-            if value is not None:
-                raise refusal(name, value, "None", "with an array as input_signal")
-        return ArrayInput.create(inputs, kind, horizon)
-    amplitude, period, phase = shape.values()
-    if kind == "sinusoids":
-        return Sinusoids.create(inputs, amplitude, period, phase)
-    if not (isinstance(phase, str) and phase == "random"):
-        reason = "phases belong to 'sinusoids'"
-        raise forbidden("input_phase", phase, reason, f"with input_signal={kind!r}")
-    if kind == "steps":
-        return Steps.create(inputs, amplitude, period)
-    return MeanRevertingWalk.create(inputs, amplitude, period)
 
 
 def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:

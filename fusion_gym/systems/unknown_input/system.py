@@ -220,28 +220,20 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
     def start(self, measurement: Array, announcement: None) -> UnknownInputEstimate:
         """Return equal estimates; every first measurement is known without charge."""
         runs = measurement.shape[-1]
-        return UnknownInputEstimate(
-            measurement=measurement,
-            held=measurement,
-            age=np.zeros((self.nodes.sensors.count, runs)),
-            time=np.zeros(runs),
-            estimates=self.nodes.start(runs),
-            prediction=None,
-        )
+        return UnknownInputEstimate.begin(measurement, np.zeros(runs), self.nodes.start(runs), None)
 
     def predict(self, state: UnknownInputEstimate) -> UnknownInputEstimate:
         """Predict at the nodes."""
-        prediction = self.nodes.predict(state.estimates)
-        return replace(state, age=state.age + 1.0, time=state.time + 1.0, prediction=prediction)
+        return state.later(time=state.time + 1.0, prediction=self.nodes.predict(state.estimates))
 
     def update(self, state: UnknownInputEstimate, reception: Reception) -> UnknownInputEstimate:
         """Update the nodes with the measurements that arrive, and fuse.
 
         Source: unknown_input, equations (8), (24), (25).
         """
-        prediction, arrived = knowledge.sensed(state.prediction), reception.arrived
-        after = state.after(arrived)
-        estimates = self.nodes.update(state.estimates, prediction, after.held, arrived, state.time)
+        knowledge.sensed(state.prediction)
+        after = state.after(reception.arrived)
+        estimates = self.nodes.update(after, reception.arrived)
         return replace(after, estimates=estimates)
 
     def read(self, state: UnknownInputEstimate, failure: Array | None = None) -> SignalValues:
@@ -251,7 +243,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
-            return self.nodes.variances(state.estimates, prediction, self.state_weights, state.time)
+            return self.nodes.variances(state, self.state_weights)
 
         return {
             **super().read(state, failure),
