@@ -28,7 +28,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.vector import step_infos
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.errors import refusal
-from fusion_gym.systems.tobit.system import CensoredEstimator
+from fusion_gym.systems.solvable import ParametricEstimator
 
 jnp = jax.numpy
 
@@ -89,17 +89,8 @@ class FunctionalEnv:
         self._view = SchedulerView(task)
         self._starts = task.plant.start_channels + task.network.start_channels
         self._channels = task.plant.noise_channels + task.network.noise_channels
-        price = task.reward.price.fixed
-        self.default_params = EnvParams(price)
-        if isinstance(estimator, CensoredEstimator):
-            shares = getattr(estimator.centre, "share", None)
-            model, sensors = estimator.model, estimator.centre.sensors
-            self.default_params = EnvParams(
-                price,
-                model.process_covariance[..., 0] if model.schedule is None else None,
-                sensors.variance[..., 0] if sensors.schedule is None else None,
-                None if shares is None else shares[:, 0],
-            )
+        known = estimator.parameters if isinstance(estimator, ParametricEstimator) else {}
+        self.default_params = EnvParams(task.reward.price.fixed, **known)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -292,9 +283,9 @@ class FunctionalEnv:
         if not changed:
             return self.task
         estimator = self.task.estimator
-        if not isinstance(estimator, CensoredEstimator):
+        if not isinstance(estimator, ParametricEstimator):
             raise refusal("params", sorted(changed), "only price", f"in {self.name}")
-        return dataclasses.replace(self.task, estimator=estimator.with_model(**changed))
+        return dataclasses.replace(self.task, estimator=estimator.with_parameters(**changed))
 
 
 def _register_state(state: Any) -> None:

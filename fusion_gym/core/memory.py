@@ -405,27 +405,6 @@ _OWN = ("own_beliefs", "own_difference", "own_value")
 _EVERY = ("beliefs", "belief_difference", "transmission_value")
 
 
-def memory_signals(owner: Owner, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
-    """Return the owner's beliefs and ``MEMORY_SIGNALS`` by name, as functions."""
-    if owner == "own":
-        values = (beliefs, lambda: beliefs().difference, lambda: beliefs().value)
-        return dict(zip(_OWN, values, strict=True))
-    values = (beliefs, lambda: beliefs().difference[0], lambda: beliefs().value)
-    return dict(zip(_EVERY, values, strict=True))
-
-
-def missing_signals(owner: Owner, delayed: bool) -> Mapping[str, str]:
-    """Return the names of absent signals, and the reason for their absence."""
-    late = "is absent, because the network has a delay and"
-    hidden = {name: f"signal {name!r} {late} {ONE_STEP}" for name in _AT_ONCE if delayed}
-    why = (
-        "is absent, because this batch does not compute it: a policy that reads beliefs must "
-        "declare the attribute memory_owner = 'scheduler' or 'own'"
-    )
-    absent = _EVERY if owner == "own" else _OWN
-    return {name: f"signal {name!r} {why}" for name in absent} | hidden
-
-
 class Memory:
     """The memory of a task's runs, which moves with them.
 
@@ -600,13 +579,27 @@ class Memory:
         return result
 
     def signals(self, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
-        """Return the signals of the beliefs by name."""
-        return memory_signals(self.owner, beliefs)
+        """Return the owner's beliefs and ``MEMORY_SIGNALS`` by name, as functions."""
+        own = self.owner == "own"
+        values = (
+            beliefs,
+            lambda: beliefs().difference if own else beliefs().difference[0],
+            lambda: beliefs().value,
+        )
+        return dict(zip(_OWN if own else _EVERY, values, strict=True))
 
     @property
     def missing_signals(self) -> Mapping[str, str]:
         """Names of the signals that are not computed, and the reasons for their absence."""
-        return missing_signals(self.owner, len(self.task.network.delay) > 1)
+        late = "is absent, because the network has a delay and"
+        names = _AT_ONCE if self.task.delayed else ()
+        hidden = {name: f"signal {name!r} {late} {ONE_STEP}" for name in names}
+        why = (
+            "is absent, because this batch does not compute it: a policy that reads beliefs must "
+            "declare the attribute memory_owner = 'scheduler' or 'own'"
+        )
+        absent = _EVERY if self.owner == "own" else _OWN
+        return {name: f"signal {name!r} {why}" for name in absent} | hidden
 
     def _make_beliefs(
         self, estimate: Any, arrival: Array | None, best: Estimate | None = None

@@ -204,20 +204,26 @@ class Network:
     @property
     def draw_channels(self) -> int:
         """Number of standard normals that :meth:`draw` takes per run."""
-        return sum(self._normals)
+        return sum(self._normals.values())
 
     @property
     def noise_channels(self) -> int:
         """Number of standard normals that :meth:`advance` takes per run."""
         return self.rule.random + self.draw_channels
 
-    @property
-    def _normals(self) -> tuple[int, ...]:
-        """Numbers of normals of moves, losses, delays, acknowledgements, hops and harvests."""
-        links, sensors = self.sensors * self._channels, self.sensors
-        pairs = (self._moves * links, self._drops * links)
-        parts = (self._longest > 0, self._reports_some, self._hops, self._harvests)
-        return *pairs, *(part * sensors for part in parts)
+    @cached_property
+    def _normals(self) -> dict[str, int]:
+        """Numbers of normals of the parts of :class:`Draws` that the network draws."""
+        channel, sensors, links = self.channel, self.sensors, self.sensors * self._channels
+        sizes = {
+            "following": links * (channel is not None and channel.states > 1),
+            "lost": links * (channel is not None and channel.loses),
+            "delay": sensors * (len(self.delay) > 1),
+            "unreported": sensors * (0.0 < self.acknowledgement < 1.0),
+            "frequency": sensors * (self.rule.contended and self.options.channels > 1),
+            "harvest": sensors * (self.bucket.draws_harvest and not self.bucket.unlimited),
+        }
+        return {name: size for name, size in sizes.items() if size}
 
     @property
     def _channels(self) -> int:
@@ -229,26 +235,6 @@ class Network:
         """Largest delay D, in steps."""
         return len(self.delay) - 1
 
-    @property
-    def _reports_some(self) -> bool:
-        return 0.0 < self.acknowledgement < 1.0
-
-    @property
-    def _moves(self) -> bool:
-        return self.channel is not None and self.channel.states > 1
-
-    @property
-    def _hops(self) -> bool:
-        return self.rule.contended and self.options.channels > 1
-
-    @property
-    def _harvests(self) -> bool:
-        return self.bucket.draws_harvest and not self.bucket.unlimited
-
-    @property
-    def _drops(self) -> bool:
-        return self.channel is not None and self.channel.loses
-
     def start(self, noise: Array) -> NetworkState:
         """Return the state at time 0.
 
@@ -258,7 +244,7 @@ class Network:
         runs, longest = noise.shape[-1], self._longest
         channel = true_drop = None
         if self.channel is not None:
-            channel = self.channel.start(noise) if self._moves else None
+            channel = self.channel.start(noise) if "following" in self._normals else None
             true_drop = self.channel.begin(noise)
         due = np.zeros((longest, self.sensors, runs), dtype=np.int64) if longest else None
         everyone = np.ones((self.sensors, runs), dtype=np.bool_)
@@ -299,28 +285,25 @@ class Network:
             state: Any state.
             noise: Standard normals (draw_channels, N).
         """
-        ends = np.cumsum(self._normals)
-        cuts = zip(ends, self._normals, strict=True)
-        parts = (noise[end - size : end] for end, size in cuts if size)
-        following, lost, delay, unreported, frequency = state.channel, None, None, None, None
-        harvest = None
-        if self.channel is not None and following is not None:
-            following = self.channel.advance(following, next(parts))
-        if self.channel is not None and self._drops:
-            own = next(parts)
-            present = np.zeros(own.shape, dtype=np.int64) if following is None else following
-            lost = self.channel.lost(present, own, state.true_drop)
-        if self._longest:
+        own, end, draws = {}, 0, Draws(state.channel)
+        for name, size in self._normals.items():
+            own[name], end = noise[end : end + size], end + size
+        if self.channel is not None and state.channel is not None:
+            draws.following = self.channel.advance(state.channel, own["following"])
+        if self.channel is not None and "lost" in own:
+            nothing = np.zeros(own["lost"].shape, dtype=np.int64)
+            present = nothing if draws.following is None else draws.following
+            draws.lost = self.channel.lost(present, own["lost"], state.true_drop)
+        if "delay" in own:
             reached = np.cumsum(self.delay)[:-1, None, None]
-            delay = (ndtr(next(parts)) >= reached).sum(0)
-        if self._reports_some:
-            unreported = ndtr(next(parts)) >= self.acknowledgement
-        if self._hops:
-            drawn = (ndtr(next(parts)) * self.options.channels).astype(np.int64)
-            frequency = namespace(drawn).minimum(drawn, self.options.channels - 1)
-        if self._harvests:
-            harvest = ndtr(next(parts)) < self.bucket.rate
-        draws = Draws(following, lost, delay, unreported, frequency, harvest)
+            draws.delay = (ndtr(own["delay"]) >= reached).sum(0)
+        if "unreported" in own:
+            draws.unreported = ndtr(own["unreported"]) >= self.acknowledgement
+        if "frequency" in own:
+            drawn = (ndtr(own["frequency"]) * self.options.channels).astype(np.int64)
+            draws.frequency = namespace(drawn).minimum(drawn, self.options.channels - 1)
+        if "harvest" in own:
+            draws.harvest = ndtr(own["harvest"]) < self.bucket.rate
         return replace(state, draws=draws)
 
     def grant(self, state: NetworkState, requests: NDArray[Any], runs: Any = slice(None)) -> Grants:
@@ -402,7 +385,7 @@ class Network:
         Args:
             state: State before the requests.
         """
-        if not self._drops and not self._longest:
+        if "lost" not in self._normals and not self._longest:
             return None
         runs = state.queue.shape[-1]
         arrival: Any = np.ones((self.sensors * self._channels, runs))

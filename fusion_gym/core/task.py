@@ -208,8 +208,7 @@ class Task(Scenario):
             ConfigurationError: A value is not allowed.
         """
         options, plant, estimator = scenario.options, scenario.plant, scenario.estimator
-        parts = (("plant", plant, Plant), ("estimator", estimator, Estimator))
-        for name, part, kind in parts:
+        for name, part, kind in (("plant", plant, Plant), ("estimator", estimator, Estimator)):
             if not isinstance(part, kind):
                 allowed = f"an instance of {kind.__module__}.{kind.__name__}"
                 raise refusal(name, part, allowed)
@@ -223,11 +222,11 @@ class Task(Scenario):
             raise refusal("memory_filter", options.memory_filter, allowed)
         if memory is None and not scenario.nodes_have_memory:
             memory = estimator
-        warn_of_uneven_grants(Network(options, plant.sensor_count))
-        values: Options = {name.name: getattr(scenario, name.name) for name in fields(scenario)}
-        values |= {"state_weights": weights, "memory_estimator": memory if options.memory else None}
-        task = cls(**values, nominal_error=nominal_error, limit=limit)
+        memory = memory if options.memory else None
+        parts = vars(scenario) | {"state_weights": weights, "memory_estimator": memory}
+        task = cls(**parts, nominal_error=nominal_error, limit=limit)
         task.reward  # noqa: B018  which checks it
+        warn_of_uneven_grants(task.network)
         return task
 
     def with_options(self, **options: Any) -> Self:

@@ -1,4 +1,4 @@
-"""What solvers and references need of a plant or an estimator, which families extend."""
+"""What solvers, references and JAX need of a plant or an estimator, which families extend."""
 
 from __future__ import annotations
 
@@ -88,4 +88,21 @@ class BoundingEstimator(Estimator[StateT]):
 
         Args:
             state: State after :meth:`update`, of an estimator that tracks them.
+        """
+
+
+class ParametricEstimator(Estimator[StateT]):
+    """An estimator whose filters have parameters, which JAX may vary."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> dict[str, Array]:
+        """Parameters by name; a scheduled one is absent."""
+
+    @abstractmethod
+    def with_parameters(self, **parameters: Array) -> Estimator[StateT]:
+        """Return the estimator with other parameters; arrays of JAX allow derivatives.
+
+        Args:
+            **parameters: Values by name.
         """

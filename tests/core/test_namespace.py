@@ -208,7 +208,7 @@ def test_derivatives_equal_central_differences(
     def error(scale: Any) -> Any:
         if parameter == "threshold":
             return smooth(scale)
-        changed = estimator.with_model(**{parameter: start + scale * direction})
+        changed = estimator.with_parameters(**{parameter: start + scale * direction})
         parts = Parts(task.plant, changed)
 
         def step(state: Any, inputs: Any) -> Any:

@@ -99,7 +99,6 @@ def test_only_the_registration_knows_the_families_of_systems() -> None:
     }
     users = {"fusion_gym", "fusion_gym.envs.registration"}
     users |= {"fusion_gym.recordings.environment"}  # it extends LinearFusion
-    users |= {"fusion_gym.jax"}  # of Tobit estimators, whose parameters it optimises
     assert families
     for module in modules().keys() - users:
         for other in imports(module):

@@ -32,8 +32,8 @@ from fusion_gym.systems.linear_plant import (
     typical_magnitude,
     variance_loss,
 )
-from fusion_gym.systems.solvable import LinearEstimator, LinearProblem
-from fusion_gym.systems.tobit.centres import STRUCTURE, Centre, Filter, Prediction
+from fusion_gym.systems.solvable import LinearEstimator, LinearProblem, ParametricEstimator
+from fusion_gym.systems.tobit.centres import STRUCTURE, Centre, Filter, NodeCentre, Prediction
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import choice
 
@@ -185,7 +185,9 @@ _SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a re
 
 @dataclass(frozen=True)
 class CensoredEstimator(
-    parts.AdoptingEstimator[CensoredEstimate], LinearEstimator[CensoredEstimate]
+    parts.AdoptingEstimator[CensoredEstimate],
+    LinearEstimator[CensoredEstimate],
+    ParametricEstimator[CensoredEstimate],
 ):
     """A centre with or without nodes.
 
@@ -255,33 +257,33 @@ class CensoredEstimator(
         both = sensors.stacked_matrix, sensors.noise_covariance
         return LinearProblem(*(array[..., 0] for array in (*motion, *both)))
 
-    def with_model(
-        self,
-        process_covariance: Array | None = None,
-        measurement_variance: Array | None = None,
-        information_shares: Array | None = None,
-    ) -> CensoredEstimator:
-        """Return the estimator with other parameters of its filters.
+    @property
+    def parameters(self) -> dict[str, Array]:
+        """W (n, n), R (sensors, m) and the shares (sensors,) of the feedback, where it has them."""
+        model, sensors = self.model, self.centre.sensors
+        result: dict[str, Array] = {}
+        if model.schedule is None:
+            result["process_covariance"] = model.process_covariance[..., 0]
+        if sensors.schedule is None:
+            result["measurement_variance"] = sensors.variance[..., 0]
+        if isinstance(self.centre, NodeCentre):
+            result["information_shares"] = self.centre.share[:, 0]
+        return result
 
-        Arrays of JAX allow derivatives with respect to them.
-
-        Args:
-            process_covariance: W (n, n).
-            measurement_variance: R (sensors, m).
-            information_shares: (sensors,), of sum 1.
-        """
+    def with_parameters(self, **parameters: Array) -> CensoredEstimator:
+        """See :class:`ParametricEstimator`."""
         model, centre = self.model, cast(Any, self.centre)
-        if process_covariance is not None:
+        if (covariance := parameters.get("process_covariance")) is not None:
             model.refuse_schedule("with another process covariance")
-            model = replace(model, process_covariance=process_covariance[..., None])
-        if measurement_variance is not None:
+            model = replace(model, process_covariance=covariance[..., None])
+        if (variance := parameters.get("measurement_variance")) is not None:
             centre.sensors.refuse_schedule("with another measurement variance")
-            variance = measurement_variance[..., None]
+            variance = variance[..., None]
             deviation = namespace(variance).sqrt(variance)
             sensors = replace(centre.sensors, variance=variance, deviation=deviation)
             centre = replace(centre, filter=replace(centre.filter, sensors=sensors))
-        if information_shares is not None:
-            centre = replace(centre, share=information_shares[:, None])
+        if (shares := parameters.get("information_shares")) is not None:
+            centre = replace(centre, share=shares[:, None])
         return replace(self, model=model, centre=centre)
 
     @property

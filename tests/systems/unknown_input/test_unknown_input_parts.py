@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fusion_gym.policies.rules.measurements import AdaptiveThreshold
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from test_unknown_input_plant import random_plant
 from fusion_gym import linalg
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.fusion.several import CovarianceIntersection, covariance_intersection_many
+from fusion_gym.policies.rules import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.environment import EXAMPLES, UnknownInputOptions
 from fusion_gym.systems.unknown_input.filters import (
     BoundTables,
