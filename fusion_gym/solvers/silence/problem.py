@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.systems.solvable import LinearEstimator, LinearProblem
+from fusion_gym.systems.solvable import LinearEstimator
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,15 @@ def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
         ConfigurationError: a task whose centre does not predict with the plant's matrix in silence,
             or weights that are not all above 0.
     """
-    problem = _problem(task)
+    problem, estimator = None, task.estimator
+    if isinstance(estimator, LinearEstimator):
+        problem = estimator.linear_problem(task.plant, "for the bound")
+    if problem is None:
+        raise validation.ConfigurationError(
+            f"plant = {type(task.plant).__name__} is not allowed for the bound: the centre must "
+            "estimate a linear plant from all measurements, as in TobitOscillator and the biased "
+            "systems"
+        )
     transition, size = problem.transition, len(problem.transition)
     weight = validation.positive("weights", np.ones(size) if weights is None else weights, (size,))
     measured = problem.measurement_matrix, problem.noise_covariance
@@ -109,18 +117,3 @@ def _update(prior: Array, matrix: Array, noise: Array) -> tuple[Array, Array]:
     posterior = keep @ prior @ keep.T + gain @ noise @ gain.T
     correction = gain @ innovation @ gain.T
     return 0.5 * (posterior + posterior.T), 0.5 * (correction + correction.T)
-
-
-def _problem(task: Task) -> LinearProblem:
-    """Return the task's plant and measurements, if the bound applies to them."""
-    plant, estimator = task.plant, task.estimator
-    problem = None
-    if isinstance(estimator, LinearEstimator):
-        problem = estimator.linear_problem(plant, "for the bound")
-    if problem is None:
-        raise validation.ConfigurationError(
-            f"plant = {type(plant).__name__} is not allowed for the bound: the centre must "
-            "estimate a linear plant from all measurements, as in TobitOscillator and the biased "
-            "systems"
-        )
-    return problem

@@ -123,10 +123,6 @@ class AugmentedModel:
             squares.append(np.diagonal(step.moment).reshape(-1, self.plant.size).sum(0))
         return np.array(means), np.array(squares)
 
-    def open_loop(self, horizon: int) -> Array:
-        """Return the mean variance (n,) of the state over k = 1..horizon."""
-        return self.scales(horizon)[0]
-
     def scales(self, horizon: int) -> tuple[Array, Array]:
         """Return mean variance (n,) over k = 1..horizon and root mean square (n,) with k = 0."""
         means, squares = self.state_moments(horizon)

@@ -15,17 +15,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    LOCAL_VARIANCE,
-    Block,
-    Signal,
-    age_block,
-    common_signals,
-    log_deviation,
-    numbered,
-    sensed,
-)
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.namespace import namespace, take
@@ -131,7 +122,7 @@ class FadingPlant(SensorPlant[MarkovJumpTruth]):
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
-        return self.model.open_loop(horizon)
+        return self.model.scales(horizon)[0]
 
 
 @dataclass(slots=True)
@@ -162,17 +153,21 @@ class MarkovJumpEstimate(Deliveries):
 
 # What both estimators of the family offer beside the common signals.
 OF_FAMILY = (
-    Signal("centre_variance", "centre", "(N,)", "plain trace of the covariance without a delivery"),
-    Signal(
+    knowledge.Signal(
+        "centre_variance", "centre", "(N,)", "plain trace of the covariance without a delivery"
+    ),
+    knowledge.Signal(
         "greedy_variance",
         "centre",
         _PER_SENSOR,
         "trace if only the sensors before this one in the greedy order transmit",
     ),
-    Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step", "own"),
+    knowledge.Signal(
+        "sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step", "own"
+    ),
 )
 SIGNALS = (
-    *common_signals(
+    *knowledge.common_signals(
         "(sensors, n, N)",
         measurement="the node's new estimate",
         innovation="the node's new estimate minus the centre's copy",
@@ -180,13 +175,13 @@ SIGNALS = (
         expected_measurement="the centre's copy, predicted",
     ),
     *OF_FAMILY,
-    LOCAL_VARIANCE,
+    knowledge.LOCAL_VARIANCE,
 )
 
 
-def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
+def sampling_blocks(sensors: FadingSensors) -> tuple[knowledge.Block, knowledge.Block]:
     """Return the blocks of the observation with the sensors' sampling phases."""
-    own = partial(Block, labels=(numbered(sensors.count),), node="own")
+    own = partial(knowledge.Block, labels=(knowledge.numbered(sensors.count),), node="own")
     since = "steps since the sensor's last sampling time over its period"
     return (
         own(
@@ -213,10 +208,10 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         return self.filters.period
 
     @property
-    def observation(self) -> tuple[Block, ...]:
+    def observation(self) -> tuple[knowledge.Block, ...]:
         """Blocks of the observation."""
-        nodes = numbered(self.model.sensors.count)
-        own, every = partial(Block, node="own", limit=RANGE), (nodes, self.state_names)
+        nodes = knowledge.numbered(self.model.sensors.count)
+        own, every = partial(knowledge.Block, node="own", limit=RANGE), (nodes, self.state_names)
         difference = "node's estimate minus the centre's copy, over its deviation"
         innovation = "node's innovation over its deviation, 0 without a sample"
         local = "logarithm of the root of the node's trace over the open-loop trace"
@@ -224,7 +219,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
             own("whitened_difference", difference, self._difference, every, "own"),
             own("whitened_innovation", innovation, self._whitened_innovation, (nodes,), "own"),
             *sampling_blocks(self.model.sensors),
-            age_block(nodes),
+            knowledge.age_block(nodes),
             own(
                 "local_log_deviation",
                 local,
@@ -301,7 +296,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
 
         Source: markov_jump, equations (34)-(39), (55)-(57).
         """
-        arrived, prediction = reception.arrived, sensed(state.prediction)
+        arrived, prediction = reception.arrived, knowledge.sensed(state.prediction)
         grant, xp = arrived[:, None], namespace(arrived)
         copy_mean = xp.where(grant, state.node_mean, state.copy_mean)
         fused = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(arrived))
@@ -316,7 +311,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
 
     def read(self, state: MarkovJumpEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
-        prediction = sensed(state.prediction)
+        prediction = knowledge.sensed(state.prediction)
         place = self.filters.at(state.time)
         return {
             **super().read(state, failure),
@@ -355,7 +350,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
 
     def _difference(self, state: MarkovJumpEstimate) -> Array:
         lag = self._collapse(state.node_mean - state.copy_mean)
-        return lag / self._lag_deviation(sensed(state.prediction))
+        return lag / self._lag_deviation(knowledge.sensed(state.prediction))
 
     def _whitened_innovation(self, state: MarkovJumpEstimate) -> Array:
         nodes, place = np.arange(self.model.sensors.count), self.filters.at(state.time)
@@ -363,11 +358,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         return state.innovation / namespace(variance).sqrt(variance)
 
     def _local_log_deviation(self, state: MarkovJumpEstimate) -> Array:
-        trace = take(self.recursion.local_trace, self.filters.at(state.time))
-        return log_deviation(trace[:, None, None], self.reference.sum(keepdims=True))[:, 0]
+        trace = take(self.recursion.local_trace, self.filters.at(state.time))[:, None, None]
+        return knowledge.log_deviation(trace, self.reference.sum(keepdims=True))[:, 0]
 
     def _copy_covariance(self, state: MarkovJumpEstimate) -> Array:
-        prediction, nodes = sensed(state.prediction), np.arange(self.model.sensors.count)
+        prediction, nodes = knowledge.sensed(state.prediction), np.arange(self.model.sensors.count)
         return prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:

@@ -66,6 +66,7 @@ class Centre(Protocol):
         reads_silence: Whether a step without a delivery is information.
         traceable: Whether JAX traces the methods.
         predicts: Whether a step without a delivery only predicts, by A x̂.
+        predictable: Whether the covariances depend on the deliveries only.
     """
 
     filter: Any
@@ -73,6 +74,7 @@ class Centre(Protocol):
     reads_silence: ClassVar[bool] = False
     traceable: ClassVar[bool] = True
     predicts: ClassVar[bool] = False
+    predictable: ClassVar[bool] = False
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -85,11 +87,6 @@ class Centre(Protocol):
         if sensors is self.sensors:
             return self
         return replace(cast(Any, self), filter=replace(self.filter, sensors=sensors))
-
-    @property
-    def predictable(self) -> bool:
-        """Whether the covariances depend on the deliveries only."""
-        return False
 
     def advance(self, model: LinearPlant, state: Any) -> Prediction:
         """Return the prediction one step after a state's delivery."""
@@ -173,7 +170,7 @@ class NodeCentre(Centre):
         return self.filter.predicts
 
     @property
-    def predictable(self) -> bool:
+    def predictable(self) -> bool:  # type: ignore[override]
         """See :class:`Centre`; true for Kalman filters of uncensored sensors."""
         return type(self.filter) is KalmanFilter and self.sensors.unlimited
 

@@ -20,13 +20,7 @@ from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.parts import numbered_states, trigger_parameters
-from fusion_gym.systems.tobit import centres, system
-from fusion_gym.systems.tobit.filters import (
-    BoundConstants,
-    BoundTobitFilter,
-    EventError,
-    TobitKalmanFilter,
-)
+from fusion_gym.systems.tobit import centres, filters, system
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _ANGLE = 0.052 * math.pi
@@ -37,10 +31,10 @@ _HELD = "the silent filter continues from the last delivered measurement (silent
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
     "paper": centres.Filter(
-        BoundTobitFilter,
+        filters.BoundTobitFilter,
         lambda options, sensors: centres.feedback_centre(options, _bound_filter(options, sensors)),
     ),
-    "tobit": centres.at_the_nodes(TobitKalmanFilter),
+    "tobit": centres.at_the_nodes(filters.TobitKalmanFilter),
     **centres.FILTERS,
 }
 
@@ -166,22 +160,22 @@ def _plant(options: TobitOscillatorOptions) -> LinearPlant:
     )
 
 
-def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
+def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> filters.NodeFilter:
     """Return the paper's filter, with its constants and the trigger's Ξ."""
-    constants = BoundConstants.create(options.bound_epsilon)
+    constants = filters.BoundConstants.create(options.bound_epsilon)
     if np.min(options.bound_epsilon) < _SMALLEST_EPSILON:
         allowed = f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound"
         raise validation.refusal("bound_epsilon", options.bound_epsilon, allowed)
     trigger = _trigger(options, sensors.count)
-    error = EventError.create(trigger, options.bound_young, sensors.count)
+    error = filters.EventError.create(trigger, options.bound_young, sensors.count)
     with_error = options.event_error is None or options.event_error
     hold = options.silent != "predict"
     if with_error and options.filter == "paper":
         _refuse_explosion(options, error)
-    return BoundTobitFilter(sensors, constants, error if with_error else None, hold=hold)
+    return filters.BoundTobitFilter(sensors, constants, error if with_error else None, hold=hold)
 
 
-def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> None:
+def _refuse_explosion(options: TobitOscillatorOptions, error: filters.EventError) -> None:
     """Refuse a horizon over which the bound of the event error overflows."""
     reached = error.at(np.array([float(options.horizon)]))
     if not np.all(reached <= _LARGEST_EVENT_ERROR):

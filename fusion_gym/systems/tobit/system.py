@@ -25,13 +25,7 @@ from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.fusion.table import Structure
 from fusion_gym.namespace import namespace
-from fusion_gym.systems import parts
-from fusion_gym.systems.linear_plant import (
-    LinearPlant,
-    largest_ratio,
-    typical_magnitude,
-    variance_loss,
-)
+from fusion_gym.systems import linear_plant, parts
 from fusion_gym.systems.solvable import LinearEstimator, LinearProblem, ParametricEstimator
 from fusion_gym.systems.tobit.centres import STRUCTURE, Centre, Filter, NodeCentre, Prediction
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -49,7 +43,7 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
     oscillator that is a random phase. ``nature`` is the departure of the truth from this model.
     """
 
-    dynamics: LinearPlant
+    dynamics: linear_plant.LinearPlant
     sensors: CensoredSensors
     state_names: tuple[str, ...]
     random_start: bool = False
@@ -113,8 +107,8 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
         every = self.sensors.each_step
         rows = np.moveaxis(every.measurement_matrix / every.deviation[:, :, None], -1, 0)
         moments = self.dynamics.second_moments(horizon, self.random_start)
-        loss = variance_loss(self.dynamics, horizon, self._packets)
-        return largest_ratio(moments, rows), loss
+        loss = linear_plant.variance_loss(self.dynamics, horizon, self._packets)
+        return linear_plant.largest_ratio(moments, rows), loss
 
     def _packets(self, time: int) -> Iterator[tuple[Array, Array]]:
         """Yield matrices and noises of the single packets of a time, then of all together."""
@@ -197,7 +191,7 @@ class CensoredEstimator(
     from it, and a measurement of NaN is a gap.
     """
 
-    model: LinearPlant
+    model: linear_plant.LinearPlant
     centre: Centre
     state_names: tuple[str, ...]
     scale: Array
@@ -476,7 +470,7 @@ def feedback_scenario(
     *,
     memory_filter: str | None = None,
     policy_defaults: Mapping[str, dict[str, Any]] | None = None,
-    model: LinearPlant | None = None,
+    model: linear_plant.LinearPlant | None = None,
     known_start: bool = False,
     **others: Any,
 ) -> Scenario:
@@ -521,7 +515,7 @@ def feedback_scenario(
         model=plant if model is None else model,
         centre=centre,
         state_names=names,
-        scale=typical_magnitude(plant, options.horizon, truth.random_start),
+        scale=linear_plant.typical_magnitude(plant, options.horizon, truth.random_start),
         reference=plant.open_loop(min(options.horizon, reference_horizon)),
         known_start=known_start,
     )

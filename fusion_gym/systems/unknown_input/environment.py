@@ -247,13 +247,8 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
     names = _state_names(options, plant)
     plant.warn_of_unseen_growth(sensors.measurement_matrix, names)
     truth = DrivenPlant(plant, signal, sensors, names, nature)
-    estimator = UnknownInputEstimator(
-        nodes=_nodes(options, plant, sensors, horizon),
-        state_names=names,
-        state_weights=weights,
-        magnitude=plant.magnitude(signal, horizon),
-        reference=open_loop,
-    )
+    scales = names, weights, plant.magnitude(signal, horizon), open_loop
+    estimator = UnknownInputEstimator(*scales, _nodes(options, plant, sensors, horizon))
     # The paper's filter minimises a bound; its memory has the random walk's.
     kind, memory = options.memory_filter, None
     if kind is None and options.filter == "paper":

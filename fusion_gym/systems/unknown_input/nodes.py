@@ -18,12 +18,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.fusion import several
 from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
-from fusion_gym.fusion.several import (
-    CovarianceIntersection,
-    covariance_intersection_many,
-    is_regular,
-)
 from fusion_gym.namespace import in_runs, namespace, put_runs, set_at, take
 from fusion_gym.systems.unknown_input.filters import (
     BoundTables,
@@ -45,7 +41,7 @@ class NodeFusion(FusionRule):
     ``rule`` joins the ``states`` n entries of the nodes' states, and their inputs. With
     :class:`~fusion_gym.fusion.several.CovarianceIntersection` and ``tracked``, its weights follow
     the smallest trace from one time to the next (:func:`tracked_intersection`), starting from the
-    weights of :meth:`going_on`.
+    last ``weights`` (l, N).
 
     Covariance intersection gives a bound for every correlation of the nodes' errors, provided that
     the nodes' covariances are bounds. Its inverse form does not, because the errors share process
@@ -57,14 +53,6 @@ class NodeFusion(FusionRule):
     tracked: bool = False
     state_weights: Array | None = None
     weights: Array | None = None
-
-    def start(self, nodes: int, runs: int) -> Array | None:
-        """Return equal weights (l, N) if weights are tracked."""
-        return np.full((nodes, runs), 1.0 / nodes) if self.tracked else None
-
-    def going_on(self, weights: Array | None) -> NodeFusion:
-        """Return the rule that starts from the last weights (l, N)."""
-        return self if weights is None else replace(self, weights=weights)
 
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
@@ -104,7 +92,7 @@ class NodeFusion(FusionRule):
         if len(means) == 1:
             identity = linalg.identity(means.shape[1]) * ones
             return Fused(means[0], own[0], lambda: identity[None], ones)
-        if isinstance(rule, CovarianceIntersection):
+        if isinstance(rule, several.CovarianceIntersection):
             if means.shape[1] == 1:
                 return _smallest_variance(means, own)
             if self.weights is not None:
@@ -131,7 +119,7 @@ def tracked_intersection(
     w_i Y_i)⁻¹, until the trace of P is within 1 % of its minimum: the gap is at most max_i tr(P Y_i
     P) - tr P. A call makes at most four evaluations; the next call continues. Every P is a bound,
     since any weights give one. For a nearly singular estimate the search is
-    :func:`covariance_intersection_many`.
+    :func:`~fusion_gym.fusion.several.covariance_intersection_many`.
 
     Args:
         mean: (l, n, N).
@@ -169,10 +157,10 @@ def tracked_intersection(
         moved = xp.maximum(some * xp.sqrt(gain), _FLOOR**2)
         weights = put_runs(weights, lanes, moved / linalg.total(moved, 0))
     joined = linalg.matvec(fused, linalg.total(weights[:, None] * vectors, 0))
-    singular: Any = ~is_regular(covariance, information).all(0)
+    singular: Any = ~several.is_regular(covariance, information).all(0)
 
     def best(mean: Array, covariance: Array, basis: Array | None = None) -> tuple[Any, ...]:
-        found = covariance_intersection_many(mean, covariance, basis=basis)
+        found = several.covariance_intersection_many(mean, covariance, basis=basis)
         return found.mean, found.covariance, found.weights, found.gains
 
     arguments = (mean, covariance) if basis is None else (mean, covariance, basis)
@@ -271,16 +259,10 @@ class TableNodes(_Nodes):
                 unit[node, entry] = 1.0
                 result = fusion.fuse(unit, tables.covariance)
                 gains[node, :, entry], fused = result.mean, result.covariance
-        return cls(
-            model=model,
-            sensors=sensors,
-            tables=tables,
-            state_gain=gains[:, :n, :n],
-            input_gain=gains[:, n:, n:],
-            fused=fused,
-            delivered=fusion.fuse_single(tables.covariance, tables.delivered)[1],
-            prior=model.predict_covariance(np.roll(tables.covariance, 1, axis=-1)),
-        )
+        delivered = fusion.fuse_single(tables.covariance, tables.delivered)[1]
+        prior = model.predict_covariance(np.roll(tables.covariance, 1, axis=-1))
+        both = gains[:, :n, :n], gains[:, n:, n:]
+        return cls(model, sensors, tables, *both, fused, delivered, prior)
 
     def start(self, runs: int) -> Estimates:
         """Return the estimates before any measurement; covariances stay in the tables."""
@@ -347,7 +329,7 @@ class RunNodes(_Nodes):
         """Return the estimates before any measurement, equal for all nodes."""
         mean, fused, covariance = self._start(runs)
         every = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape)).copy()
-        weights = self.fusion.start(self.sensors.count, runs)
+        weights = np.full((len(mean), runs), 1.0 / len(mean)) if self.fusion.tracked else None
         return Estimates(mean, fused, every, covariance, weights)
 
     def update(self, state: Any, granted: NDArray[np.bool_]) -> Estimates:
@@ -360,7 +342,8 @@ class RunNodes(_Nodes):
             prior = prediction.covariance
             covariance = namespace(granted).where(grant[:, None], covariance, prior)
         mean = prediction.mean + correction
-        fused = self.fusion.going_on(state.estimates.weights).fuse(mean, covariance)
+        fusion = replace(self.fusion, weights=state.estimates.weights)
+        fused = fusion.fuse(mean, covariance)
         return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)
 
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:

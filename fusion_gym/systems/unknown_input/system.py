@@ -64,13 +64,10 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         noise, departure = self.nature.begin(noise)
         state = self.dynamics.start(noise[:n])
         first = true_noise(departure, noise[:0], noise[n : n + count])[1]
-        return UnknownInputTruth(
-            truth=namespace(noise).concatenate((state, np.zeros((self.dynamics.inputs, runs)))),
-            signal=self.signal.start(noise[n + count :]),
-            time=np.zeros(runs),
-            measurement=self.sensors.measure(state, first),
-            departure=departure,
-        ), None
+        truth = namespace(noise).concatenate((state, np.zeros((self.dynamics.inputs, runs))))
+        measurement = self.sensors.measure(state, first)
+        signal = self.signal.start(noise[n + count :])
+        return UnknownInputTruth(truth, measurement, departure, np.zeros(runs), signal), None
 
     def sense(self, state: UnknownInputTruth, noise: Array) -> UnknownInputTruth:
         """Move the plant under the input for one interval, and measure.
@@ -83,13 +80,10 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         process, own = true_noise(departure, noise[drawn : drawn + r], noise[drawn + r :])
         last = state.truth[: self.dynamics.size]
         moved = self.dynamics.advance(last, inputs, process, departure)
-        return replace(
-            state,
-            truth=namespace(moved, inputs).concatenate((moved, inputs)),
-            signal=self.signal.advance(state.signal, noise[:drawn]),
-            time=state.time + 1.0,
-            measurement=self.sensors.measure(moved, own),
-        )
+        truth = namespace(moved, inputs).concatenate((moved, inputs))
+        measurement = self.sensors.measure(moved, own)
+        signal = self.signal.advance(state.signal, noise[:drawn])
+        return UnknownInputTruth(truth, measurement, departure, state.time + 1.0, signal)
 
     @property
     def draw_channels(self) -> int | None:
@@ -125,13 +119,9 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         gained = linalg.solve(spread, linalg.transpose(cross))
         left = linalg.symmetrise(covariance[:n, :n] - linalg.matmul(cross, gained))
         moved = mean[:n] + linalg.matvec(linalg.transpose(gained), off)
-        return UnknownInputTruth(
-            truth=np.concatenate((linalg.draw_normal(moved, left, first), mean[n:] + off)),
-            signal=self.signal.advance(memory, moving),
-            time=time,
-            measurement=measurement,
-            departure=None,
-        )
+        truth = np.concatenate((linalg.draw_normal(moved, left, first), mean[n:] + off))
+        signal = self.signal.advance(memory, moving)
+        return UnknownInputTruth(truth, measurement, None, time, signal)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean squared error (n + q,) over k = 1..horizon of a prediction with d = 0."""
