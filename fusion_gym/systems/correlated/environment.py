@@ -21,9 +21,9 @@ from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.table import Structure, choose_rule
+from fusion_gym.systems.bases import numbered_states, trigger_parameters
 from fusion_gym.systems.correlated import filters, system
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.systems.parts import numbered_states, trigger_parameters
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 
 _T = 0.01  # the paper's sampling time

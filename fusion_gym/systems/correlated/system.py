@@ -21,6 +21,7 @@ from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.several import CovarianceIntersection
 from fusion_gym.namespace import namespace, ndtr, set_at, update_at
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.correlated.filters import (
     CorrelatedSensors,
     JointErrorCovariance,
@@ -28,7 +29,6 @@ from fusion_gym.systems.correlated.filters import (
     RobustOutcomes,
 )
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.solvable import BoundingEstimator
 from fusion_gym.validation import refusal
 

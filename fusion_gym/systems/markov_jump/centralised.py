@@ -23,6 +23,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.namespace import namespace, set_at, take, update_at
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     LONGEST,
     ROUNDING,
@@ -31,7 +32,6 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     settled,
 )
 from fusion_gym.systems.markov_jump.system import OF_FAMILY, sampling_blocks
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator
 
 _ALL = slice(None)
 

@@ -20,6 +20,7 @@ from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.markov_jump import centralised
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
@@ -28,7 +29,6 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import (
 )
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 from fusion_gym.systems.markov_jump.system import FadingPlant, MarkovJumpEstimator
-from fusion_gym.systems.parts import numbered_states
 
 _T = 0.5  # the paper's sampling time in seconds
 FILTERS: dict[str, type] = {

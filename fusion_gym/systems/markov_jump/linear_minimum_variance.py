@@ -150,9 +150,8 @@ class AugmentedModel:
             means = share @ moved
             apart = moved - means[:, None]
             spreads = phi @ spreads @ phi.swapaxes(1, 2) + driven
-            spreads = np.tensordot(share, spreads, 1) + np.einsum(
-                "mn,mni,mnj->mij", share, apart, apart
-            )
+            between = np.einsum("mn,mni,mnj->mij", share, apart, apart)
+            spreads = np.tensordot(share, spreads, 1) + between
         return np.array(result)
 
 
@@ -302,9 +301,8 @@ def _advance(
 ) -> tuple[dict[str, Array], Array]:
     """Return one time's row of the tables, and the next joint prediction covariance."""
     sensors, transition, faded = model.sensors, model.transition, model.faded
-    own = sensors.fading_variance * np.einsum(
-        "la,ab,lb->l", model.unfaded, step.moment, model.unfaded
-    )
+    square = np.einsum("la,ab,lb->l", model.unfaded, step.moment, model.unfaded)
+    own = sensors.fading_variance * square
     noise = noise + np.diag(own + sensors.variance[:, 0])
     observed = np.einsum("ijab,jb->ija", joint, faded)  # E L_i (c_j L_j)
     innovation = np.einsum("ia,ija->ij", faded, observed) + noise

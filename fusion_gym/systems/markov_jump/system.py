@@ -20,6 +20,7 @@ from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.namespace import namespace, take
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
     JointPrediction,
@@ -29,7 +30,6 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     Times,
 )
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant, Modes, draw_mode
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 
 _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero right after a packet
 _PER_SENSOR = "(sensors, N)"

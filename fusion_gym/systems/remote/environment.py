@@ -21,7 +21,7 @@ from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import TokenBucket, Tokens
 from fusion_gym.declaration import NumpyOnly
 from fusion_gym.errors import forbidden
-from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.remote import vector
 from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
 from fusion_gym.systems.silence import Silence, Trigger

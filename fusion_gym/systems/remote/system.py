@@ -17,7 +17,7 @@ from fusion_gym.core.estimator import Estimator, Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.namespace import namespace
-from fusion_gym.systems.parts import RANGE, Deliveries
+from fusion_gym.systems.bases import RANGE, Deliveries
 from fusion_gym.systems.silence import Silence
 from fusion_gym.systems.solvable import IndependentSources
 

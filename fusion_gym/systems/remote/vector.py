@@ -17,7 +17,7 @@ from fusion_gym.core.knowledge import Block, common_signals
 from fusion_gym.core.plant import Nature, true_motion, true_noise
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
-from fusion_gym.systems.parts import Deliveries, NormalPlant, Truth, numbered_states
+from fusion_gym.systems.bases import Deliveries, NormalPlant, Truth, numbered_states
 from fusion_gym.systems.remote.system import error_blocks
 from fusion_gym.systems.solvable import AgedSources
 
@@ -309,9 +309,8 @@ class VectorEstimator(Estimator[VectorEstimate]):
         """Return estimates 0 with the nodes' steady covariance."""
         runs, xp = measurement.shape[-1], namespace(measurement)
         nothing = xp.zeros((*self.error_scale.shape, runs))
-        blocks = xp.array(
-            np.broadcast_to(self.model.posterior, (*nothing.shape[:2], *nothing.shape[1:]))
-        )
+        shape = (*nothing.shape[:2], *nothing.shape[1:])
+        blocks = xp.array(np.broadcast_to(self.model.posterior, shape))
         age = xp.zeros((len(nothing), runs))
         return VectorEstimate(measurement, nothing, age, nothing, nothing, nothing, blocks, blocks)
 

@@ -22,8 +22,8 @@ from fusion_gym.core.access import AccessRule
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import Tokens
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.tobit import centres, system
 from fusion_gym.systems.tobit.filters import TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -148,9 +148,8 @@ def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
     horizon = validation.horizon(options.horizon)
     plant, states = _augmented(options, aware=True)
     model = plant if options.bias_aware else _augmented(options, aware=False)[0]
-    matrices = validation.array(
-        "measurement_matrices", options.measurement_matrices, (None, None, states)
-    )
+    shape = (None, None, states)
+    matrices = validation.array("measurement_matrices", options.measurement_matrices, shape)
     sensors = CensoredSensors.create(
         np.pad(matrices, ((0, 0), (0, 0), (0, plant.size - states))),
         options.measurement_variance,

@@ -530,9 +530,8 @@ class BoundConstants:
         Raises:
             ConfigurationError: another number of entries, or an entry <= 0.
         """
-        e = validation.positive(
-            "bound_epsilon", validation.array("bound_epsilon", epsilon, (14,)), (14,)
-        )
+        given = validation.array("bound_epsilon", epsilon, (14,))
+        e = validation.positive("bound_epsilon", given, (14,))
         kappa = (
             1 + e[0] + e[1] + e[2] + e[3] + e[4],
             1 + 1 / e[0] + 1 / e[6] + 1 / e[9] + 1 / e[11] + 1 / e[12],

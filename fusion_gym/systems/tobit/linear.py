@@ -14,8 +14,8 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Scenario
 from fusion_gym.declaration import NumpyOnly, plain_options
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 from fusion_gym.systems.silence import Trigger
 from fusion_gym.systems.tobit import centres, system

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import SharingRule
+from fusion_gym.systems.bases import numbered_states, trigger_parameters
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import numbered_states, trigger_parameters
 from fusion_gym.systems.tobit import centres, filters, system
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 

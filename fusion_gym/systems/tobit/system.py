@@ -25,7 +25,7 @@ from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.fusion.table import Structure
 from fusion_gym.namespace import namespace
-from fusion_gym.systems import linear_plant, parts
+from fusion_gym.systems import bases, linear_plant
 from fusion_gym.systems.solvable import LinearEstimator, LinearProblem, ParametricEstimator
 from fusion_gym.systems.tobit.centres import STRUCTURE, Centre, Filter, NodeCentre, Prediction
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -36,7 +36,7 @@ _OF_FUSION = ("fusion", "information_shares", "order")
 
 
 @dataclass(frozen=True)
-class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
+class CensoredPlant(bases.SensorPlant[bases.Truth], bases.NormalPlant):
     """A linear plant and censored sensors.
 
     ``random_start`` draws the direction of the initial mean uniformly and announces it. For the
@@ -76,7 +76,7 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
                 result[state] = (min(before[0], ends[0]), max(before[1], ends[1]))
         return result
 
-    def start(self, noise: Array) -> tuple[parts.Truth, Any]:
+    def start(self, noise: Array) -> tuple[bases.Truth, Any]:
         """Draw the initial state, and announce its mean (n, N)."""
         n = self.dynamics.size
         noise, departure = self.nature.begin(noise)
@@ -89,9 +89,9 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
         own = true_noise(departure, noise[:0], noise[2 * n :])[1]
         time = xp.zeros(runs)
         measurement = self.sensors.at(time).measure(truth, own, departure)
-        return parts.Truth(truth, measurement, departure, time), mean
+        return bases.Truth(truth, measurement, departure, time), mean
 
-    def sense(self, state: parts.Truth, noise: Array) -> parts.Truth:
+    def sense(self, state: bases.Truth, noise: Array) -> bases.Truth:
         """Move the plant, and measure.
 
         Source: tobit_token_bucket, equations (1) and (2).
@@ -100,7 +100,7 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
         process, own = true_noise(departure, noise[:r], noise[r:])
         truth = self.dynamics.at(state.time).advance(state.truth, process, departure)
         measurement = self.sensors.at(time).measure(truth, own, departure)
-        return parts.Truth(truth, measurement, departure, time)
+        return bases.Truth(truth, measurement, departure, time)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`Plant`."""
@@ -148,7 +148,7 @@ class DailyLevel:
 
 
 @dataclass(slots=True)
-class CensoredEstimate(parts.Deliveries):
+class CensoredEstimate(bases.Deliveries):
     """The estimate of N runs at one time; n states.
 
     ``time`` (N,), the step in the episode · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N),
@@ -179,7 +179,7 @@ _SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a re
 
 @dataclass(frozen=True)
 class CensoredEstimator(
-    parts.AdoptingEstimator[CensoredEstimate],
+    bases.AdoptingEstimator[CensoredEstimate],
     LinearEstimator[CensoredEstimate],
     ParametricEstimator[CensoredEstimate],
 ):
@@ -286,7 +286,7 @@ class CensoredEstimator(
         sensors = self.centre.sensors
         nodes = numbered(sensors.count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
-        new = partial(own, knowledge="own", limit=parts.RANGE)
+        new = partial(own, knowledge="own", limit=bases.RANGE)
         at_threshold = "whether the component is at its threshold"
         uncensored = "predicted probability that the component is not censored"
         divisor, unit = 2.0 * sensors.deviation, "two noise deviations"
@@ -308,8 +308,8 @@ class CensoredEstimator(
                 lambda s: sensed(s.prediction).expectation.uncensored_probability,
             ),
             age_block(nodes),
-            parts.variance_block(self._log_variance, self.state_names, self.reference),
-            parts.prior_block(self.state_names, self.scale),
+            bases.variance_block(self._log_variance, self.state_names, self.reference),
+            bases.prior_block(self.state_names, self.scale),
         ]
         if sensors.unlimited:  # these two would say nothing
             blocks = [block for block in blocks if block.name not in _OF_CENSORING]

@@ -22,7 +22,7 @@ from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.unknown_input import filters
 from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
 from fusion_gym.systems.unknown_input.plant import (
@@ -347,12 +347,10 @@ def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizo
 def _trigger(options: Any, sensors: int) -> dict[str, tuple[float, ...]]:
     """Return the parameters of the adaptive threshold trigger, one number per sensor."""
     names = ("rho_bar", "rho_initial", "adaptation")
-    spread = {
-        name: tuple(validation.spread(name, getattr(options, name), (sensors,)).tolist())
-        for name in names
-    }
-    validation.adaptive_thresholds(*spread.values())
-    return spread
+    each = [validation.spread(name, getattr(options, name), (sensors,)) for name in names]
+    values = [tuple(own.tolist()) for own in each]
+    validation.adaptive_thresholds(*values)
+    return dict(zip(names, values, strict=True))
 
 
 def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Array:
@@ -360,10 +358,8 @@ def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Arr
     chosen = options.own_weights(len(open_loop))
     if chosen is not None:
         return chosen
-    share = np.ones(len(open_loop))
-    share[len(share) - inputs :] = validation.number(
-        "input_weight", options.input_weight, at_least=0.0
-    )
+    share, weight = np.ones(len(open_loop)), options.input_weight
+    share[len(share) - inputs :] = validation.number("input_weight", weight, at_least=0.0)
     return share / (share.sum() * open_loop)
 
 

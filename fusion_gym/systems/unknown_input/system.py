@@ -16,8 +16,8 @@ from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.namespace import namespace, ndtr
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.linear_plant import largest_ratio
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
 from fusion_gym.systems.unknown_input.plant import InputSensors, InputSignal, UnknownInputPlant
 

@@ -1,4 +1,4 @@
-"""What plants and estimators of several families share: states, channels, blocks."""
+"""Base classes of states, plants and estimators, and blocks that several families share."""
 
 from __future__ import annotations
 
