@@ -175,10 +175,8 @@ def _constrained(
     half = xp.stack([orthonormalise(linalg.root(item)[None])[:, size : 2 * size] for item in own])
     legs = linalg.matmul(half, root)
     information = linalg.matmul(linalg.transpose(legs), legs)
-    information = linalg.add_diagonal(
-        information, xp.where(root.any(0), 0.0, 1.0)
-    )  # for unused directions
-    information = information * selected[:, None, None]
+    unused = xp.where(root.any(0), 0.0, 1.0)
+    information = linalg.add_diagonal(information, unused) * selected[:, None, None]
     start = selected / selected.sum(0)
     weights, inside = _search(information, linalg.matmul(basis, root), start)
     part = linalg.matmul(linalg.matmul(root, inside), linalg.transpose(legs))

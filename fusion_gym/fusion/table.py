@@ -10,11 +10,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import forbidden
-from fusion_gym.fusion.intersection import (
-    SequentialIntersection,
-    covariance_intersection,
-    inverse_covariance_intersection,
-)
+from fusion_gym.fusion import intersection
 from fusion_gym.fusion.rules import FusionRule, InformationFusion, MatrixWeightedFusion
 from fusion_gym.fusion.several import CovarianceIntersection
 
@@ -65,8 +61,8 @@ class FusionRow:
     cubic: bool = False
 
 
-_IN_TURN = partial(SequentialIntersection, covariance_intersection)
-_INVERSE = partial(SequentialIntersection, inverse_covariance_intersection)
+_IN_TURN = intersection.SequentialIntersection
+_INVERSE = partial(_IN_TURN, intersection.inverse_covariance_intersection)
 RULES = {
     "federated": FusionRow(
         InformationFusion, "information shares", "Sum of information, fed back in shares."

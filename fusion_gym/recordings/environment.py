@@ -16,8 +16,8 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.task import Scenario
 from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.systems.bases import Truth
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import Truth
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
 from fusion_gym.systems.tobit.system import Announcement, CensoredPlant, DailyLevel
 from fusion_gym.validation import number

@@ -308,9 +308,8 @@ def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
     """Return the given law of the channel's state at time 0, or the stationary law."""
     states = len(transition)
     if values is not None:
-        law = validation.not_negative(
-            "initial", validation.array("initial", values, (states,)), (states,)
-        )
+        given = validation.array("initial", values, (states,))
+        law = validation.not_negative("initial", given, (states,))
         if not np.isclose(law.sum(), 1.0, rtol=0.0, atol=1e-9):
             raise validation.refusal("initial", law, "probabilities that sum to 1")
         return law

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -14,14 +14,14 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, log_deviation, numbered
-from fusion_gym.systems import parts
+from fusion_gym.systems import bases
 
 _RUNS = 1000  # that tell what happens without transmissions
 _SEED = 20_240_229  # of their noise
 
 
 @dataclass(slots=True)
-class FilteredEstimate(parts.Deliveries):
+class FilteredEstimate(bases.Deliveries):
     """The estimate of N runs at one time; n states.
 
     ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the posterior.
@@ -173,7 +173,7 @@ class NonlinearSystem(ABC):
         return moment / horizon, error / horizon
 
 
-class NonlinearPlant(parts.NormalPlant):
+class NonlinearPlant(bases.NormalPlant):
     """The truth of a :class:`NonlinearSystem`."""
 
     def __init__(self, system: NonlinearSystem) -> None:
@@ -194,26 +194,26 @@ class NonlinearPlant(parts.NormalPlant):
         """Normals of a start: state, then first measurement."""
         return len(self.state_names) + self.system.sensors * self.system.channels
 
-    def start(self, noise: Array) -> tuple[parts.Truth, None]:
+    def start(self, noise: Array) -> tuple[bases.Truth, None]:
         """Draw the initial state, and measure."""
         size, system = len(self.state_names), self.system
         mean = np.repeat(system.initial_mean[:, None], noise.shape[-1], axis=1)
         truth = mean + linalg.root(system.initial_covariance[..., None])[..., 0] @ noise[:size]
         time = np.zeros(noise.shape[-1])
-        return parts.Truth(truth, system.measured(truth, noise[size:]), None, time), None
+        return bases.Truth(truth, system.measured(truth, noise[size:]), None, time), None
 
-    def sense(self, state: parts.Truth, noise: Array) -> parts.Truth:
+    def sense(self, state: bases.Truth, noise: Array) -> bases.Truth:
         """Move the plant, and measure."""
         own = self.system.process_channels
         truth = self.system.move(state.truth, noise[:own])
-        return parts.Truth(truth, self.system.measured(truth, noise[own:]), None, state.time + 1.0)
+        return bases.Truth(truth, self.system.measured(truth, noise[own:]), None, state.time + 1.0)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""
         return self.system.silence(horizon)[1]
 
 
-class NonlinearEstimator(parts.AdoptingEstimator[FilteredEstimate]):
+class NonlinearEstimator(bases.AdoptingEstimator[FilteredEstimate]):
     """The filter of a :class:`NonlinearSystem`, at the centre."""
 
     signals = common_signals()
@@ -227,7 +227,7 @@ class NonlinearEstimator(parts.AdoptingEstimator[FilteredEstimate]):
         nodes, names = numbered(self.system.sensors), self.system.state_names
         magnitude, reference = self.system.typical
         labels = nodes, numbered(self.system.channels)
-        new = partial(Block, labels=labels, knowledge="own", node="own", limit=parts.RANGE)
+        new = partial(Block, labels=labels, knowledge="own", node="own", limit=bases.RANGE)
         return (
             new(
                 "whitened_innovation",
@@ -240,10 +240,10 @@ class NonlinearEstimator(parts.AdoptingEstimator[FilteredEstimate]):
                 lambda s: (s.measurement - s.held) / (2.0 * self._deviation(s)),
             ),
             age_block(nodes),
-            parts.variance_block(
+            bases.variance_block(
                 lambda s: 2.0 * log_deviation(s.prior_covariance, reference), names, reference
             ),
-            parts.prior_block(names, magnitude),
+            bases.prior_block(names, magnitude),
         )
 
     def start(self, measurement: Array, announcement: None) -> FilteredEstimate:
@@ -251,18 +251,12 @@ class NonlinearEstimator(parts.AdoptingEstimator[FilteredEstimate]):
         runs, system = measurement.shape[-1], self.system
         mean = np.repeat(system.initial_mean[:, None], runs, axis=1)
         covariance = np.repeat(system.initial_covariance[..., None], runs, axis=-1)
-        age = np.zeros((system.sensors, runs))
-        return FilteredEstimate(measurement, measurement, age, mean, covariance, mean, covariance)
+        return FilteredEstimate.begin(measurement, mean, covariance, mean, covariance)
 
     def predict(self, state: FilteredEstimate) -> FilteredEstimate:
         """Predict."""
         mean, covariance = self.system.predict(state.mean, state.covariance)
-        return replace(
-            state,
-            age=state.age + 1.0,
-            prior_mean=mean,
-            prior_covariance=linalg.symmetrise(covariance),
-        )
+        return state.later(prior_mean=mean, prior_covariance=linalg.symmetrise(covariance))
 
     def update(self, state: FilteredEstimate, reception: Reception) -> FilteredEstimate:
         """Update the centre with the measurements that arrive, sensor by sensor."""

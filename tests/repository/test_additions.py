@@ -75,7 +75,7 @@ class Silence(Action):
 '''
 BUCKET = "core/token_bucket.py"
 RESULTS, METRICS = "evaluation/episodes.py", "evaluation/metrics.py"
-TOBIT, LINEAR = "systems/tobit/system.py", "systems/tobit/linear.py"
+TOBIT, LINEAR = "systems/tobit/centres.py", "systems/tobit/linear.py"
 ADDITIONS = {
     "a rule": Addition(
         "assert fusion_gym.make_policy('old_news:steps=4', oscillator).steps == 4\n"
@@ -116,7 +116,7 @@ ADDITIONS = {
         lines=(
             (
                 LINEAR,
-                "    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)",
+                "    filters: ClassVar[Mapping[str, type]] = centres.classes(_FILTERS)",
                 "    initial_variance: float = 1.0",
             ),
             (

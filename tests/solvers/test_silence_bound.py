@@ -23,8 +23,8 @@ from fusion_gym.solvers.silence import (
     simulate,
     solve_silence,
 )
+from fusion_gym.solvers.silence.induction import Survival
 from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, margins, spread_values
-from fusion_gym.solvers.silence.survival import Survival
 from fusion_gym.solvers.single import solve_finite
 from fusion_gym.solvers.source import ErrorGrid, SourceProblem
 from fusion_gym.validation import ConfigurationError

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.jax import FunctionalEnv
-from fusion_gym.solvers.silence.model import silence_model
+from fusion_gym.solvers.silence.problem import silence_model
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[Any]

@@ -1,10 +1,13 @@
 """A lower bound of every policy's error, by the optimal times of silence in a relaxed problem."""
 
 from fusion_gym.solvers.silence.bound import PricedCost, SilenceBound, cost_bound, silence_bound
-from fusion_gym.solvers.silence.induction import SilenceSolution, solve_silence
-from fusion_gym.solvers.silence.model import SilenceModel, silence_model
-from fusion_gym.solvers.silence.problem import SilenceProblem
-from fusion_gym.solvers.silence.simulation import UpperValue, simulate
+from fusion_gym.solvers.silence.induction import (
+    SilenceSolution,
+    UpperValue,
+    simulate,
+    solve_silence,
+)
+from fusion_gym.solvers.silence.problem import SilenceModel, SilenceProblem, silence_model
 
 __all__ = [
     "PricedCost",

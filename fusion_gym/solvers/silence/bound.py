@@ -9,9 +9,8 @@ from scipy.optimize import brentq
 
 from fusion_gym import validation
 from fusion_gym.core.task import Task
-from fusion_gym.solvers.silence.induction import SilenceSolution, solve_silence
-from fusion_gym.solvers.silence.model import SilenceModel, silence_model
-from fusion_gym.solvers.silence.simulation import simulate
+from fusion_gym.solvers.silence.induction import SilenceSolution, simulate, solve_silence
+from fusion_gym.solvers.silence.problem import SilenceModel, silence_model
 
 _ROUGH_STEP = 0.15  # in units of the root of the price, for the search of the price
 _ROUGH_EPISODES = 4000

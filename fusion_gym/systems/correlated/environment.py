@@ -21,18 +21,9 @@ from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.correlated.filters import (
-    CorrelatedSensors,
-    JointErrorCovariance,
-    RobustKalmanFilter,
-)
-from fusion_gym.systems.correlated.system import (
-    RANDOM_SCALE,
-    CorrelatedTrackingEstimator,
-    CorrelatedTrackingPlant,
-)
+from fusion_gym.systems.bases import numbered_states, trigger_parameters
+from fusion_gym.systems.correlated import filters, system
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.systems.parts import numbered_states, trigger_parameters
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 
 _T = 0.01  # the paper's sampling time
@@ -41,6 +32,7 @@ _SCHEDULED = (
     "measurement_variance", "noise_coupling",
 )  # fmt: skip
 _STRUCTURE = Structure(common="all contain the same process noise", prediction=True)
+_FILTERS = {"": filters.RobustKalmanFilter}  # without a choice
 
 
 @dataclass(frozen=True)
@@ -70,7 +62,7 @@ class CorrelatedTrackingOptions(PaperOptions):
         (3, 50, True)
     """
 
-    filters: ClassVar[Mapping[str, type]] = {"": RobustKalmanFilter}  # without a choice
+    filters: ClassVar[Mapping[str, type]] = _FILTERS
     structure: ClassVar[Structure | None] = _STRUCTURE
     transition: ArrayLike = ((1.0, _T, _T * _T / 2), (0.0, 1.0, _T), (0.0, 0.0, 1.0))
     """Φ of equations (1) and (64), (n, n)."""
@@ -142,32 +134,29 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     if options.track_actual:
         nature.refuse("with track_actual=True")
     scale = _noise_scale(options.noise_scale)
-    truth = CorrelatedTrackingPlant(plant, sensors, scale, names, nature)
-    estimator = CorrelatedTrackingEstimator(
-        model=plant,
-        filter=RobustKalmanFilter(sensors),
-        fusion=choose_rule(options.fusion, _STRUCTURE, sensors.count, options.order, chosen),
-        state_names=names,
-        state_weights=weights,
-        magnitude=typical_magnitude(plant, horizon, random_start=False),
-        reference=open_loop,
-        noise_scale=float(np.mean(RANDOM_SCALE)) if scale is None else scale,
-        joint=JointErrorCovariance.create(plant, sensors) if options.track_actual else None,
+    truth = system.CorrelatedTrackingPlant(plant, sensors, scale, names, nature)
+    scales = names, weights, typical_magnitude(plant, horizon, random_start=False), open_loop
+    fusion = choose_rule(options.fusion, _STRUCTURE, sensors.count, options.order, chosen)
+    mean_scale = float(np.mean(system.RANDOM_SCALE)) if scale is None else scale
+    estimator = system.CorrelatedTrackingEstimator(
+        *scales, plant, filters.RobustKalmanFilter(sensors), fusion, mean_scale
     )
+    if options.track_actual:
+        estimator = estimator.with_actual_covariance()
     trigger = trigger_parameters(options, ("threshold", "offset", "sensitivity"), sensors.count)
     return Scenario(options, truth, estimator, weights, {"adaptive_innovation": trigger})
 
 
 def _plant_and_sensors(
     options: CorrelatedTrackingOptions, before: CorrelatedTrackingOptions
-) -> tuple[LinearPlant, CorrelatedSensors]:
+) -> tuple[LinearPlant, filters.CorrelatedSensors]:
     """Return plant and sensors at the bounds; both use the same process normals.
 
     The sensors have the noise that has just moved the plant, by the options of the step before.
     """
     plant, _ = _plant(options)
     moved, deviation = _plant(before)
-    return plant, CorrelatedSensors.create(options, deviation, moved)
+    return plant, filters.CorrelatedSensors.create(options, deviation, moved)
 
 
 def _plant(options: CorrelatedTrackingOptions) -> tuple[LinearPlant, Array]:

@@ -170,16 +170,13 @@ class RobustKalmanFilter:
         Source: adaptive_innovation, equation (12).
         """
         sensors = self.sensors
-        cross = linalg.matmul(covariance, linalg.transpose(sensors.measurement_matrix))
-        cross += sensors.cross_covariance
+        matrix, common = sensors.measurement_matrix, sensors.cross_covariance
+        cross = linalg.matmul(covariance, linalg.transpose(matrix))
+        cross += common
         innovation = self.innovation_covariance(covariance)
         gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
-        rest = linalg.identity(covariance.shape[-2]) - linalg.matmul(
-            gain, sensors.measurement_matrix
-        )
-        shared = linalg.matmul(
-            linalg.matmul(rest, sensors.cross_covariance), linalg.transpose(gain)
-        )
+        rest = linalg.identity(covariance.shape[-2]) - linalg.matmul(gain, matrix)
+        shared = linalg.matmul(linalg.matmul(rest, common), linalg.transpose(gain))
         own = np.arange(sensors.count)
         delivered = linalg.congruence(rest, covariance)
         delivered += linalg.congruence(gain, sensors.covariance[own, own])

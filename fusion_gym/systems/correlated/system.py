@@ -21,6 +21,7 @@ from fusion_gym.fusion.intersection import SequentialIntersection
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.several import CovarianceIntersection
 from fusion_gym.namespace import namespace, ndtr, set_at, update_at
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.correlated.filters import (
     CorrelatedSensors,
     JointErrorCovariance,
@@ -28,7 +29,6 @@ from fusion_gym.systems.correlated.filters import (
     RobustOutcomes,
 )
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.solvable import BoundingEstimator
 from fusion_gym.validation import refusal
 
@@ -208,18 +208,9 @@ class CorrelatedTrackingEstimator(
         mean = np.broadcast_to(self.model.initial_mean, (nodes + 1, n, runs)).copy()
         covariance = np.broadcast_to(self.model.initial_covariance, (nodes + 1, n, n, runs)).copy()
         expected = self.filter.expect(mean[1:])
-        return CorrelatedTrackingEstimate(
-            measurement=expected,
-            held=expected,
-            age=np.zeros((nodes, runs)),
-            time=np.zeros(runs),
-            prior_mean=mean,
-            prior_covariance=covariance,
-            expected=expected,
-            outcomes=None,
-            means=mean,
-            covariances=covariance,
-            joint=None if self.joint is None else self.joint.start(runs),
+        joint = None if self.joint is None else self.joint.start(runs)
+        return CorrelatedTrackingEstimate.begin(
+            expected, np.zeros(runs), mean, covariance, expected, None, mean, covariance, joint
         )
 
     def predict(self, state: CorrelatedTrackingEstimate) -> CorrelatedTrackingEstimate:
@@ -233,9 +224,7 @@ class CorrelatedTrackingEstimator(
         joint = state.joint
         if self.joint is not None and joint is not None:
             joint = self.joint.predict(joint)
-        return replace(
-            state,
-            age=state.age + 1.0,
+        return state.later(
             time=time,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,

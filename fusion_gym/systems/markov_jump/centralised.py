@@ -23,6 +23,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.namespace import namespace, set_at, take, update_at
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     LONGEST,
     ROUNDING,
@@ -31,7 +32,6 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     settled,
 )
 from fusion_gym.systems.markov_jump.system import OF_FAMILY, sampling_blocks
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator
 
 _ALL = slice(None)
 
@@ -470,23 +470,18 @@ class MarkovJumpCentralEstimator(ScaledEstimator[MarkovJumpCentralEstimate]):
 
     def start(self, measurement: Array, announcement: None) -> MarkovJumpCentralEstimate:
         """Return the belief of time 0; nothing is measured, and its expectation is held."""
-        count, n, runs = self.model.sensors.count, self.model.plant.size, measurement.shape[-1]
+        n, runs = self.model.plant.size, measurement.shape[-1]
         belief, time = self.filter.start(runs), np.zeros(runs, dtype=np.int64)
         mean, covariance = self.filter.estimate(belief)
         held = self.filter.prediction(belief, time).mean[n:, None]
-        age = np.zeros((count, runs))
-        return MarkovJumpCentralEstimate(held, held, age, time, belief, None, mean, covariance)
+        return MarkovJumpCentralEstimate.begin(held, time, belief, None, mean, covariance)
 
     def predict(self, state: MarkovJumpCentralEstimate) -> MarkovJumpCentralEstimate:
         """Predict states and measurements."""
         time = state.time + 1
         belief = self.filter.predict(state.belief, state.time)
-        return replace(
-            state,
-            time=time,
-            age=state.age + 1.0,
-            belief=belief,
-            prediction=self.filter.prediction(belief, time),
+        return state.later(
+            time=time, belief=belief, prediction=self.filter.prediction(belief, time)
         )
 
     def observe(

@@ -20,11 +20,8 @@ from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.markov_jump.centralised import (
-    CentralisedLinearFilter,
-    InteractingModels,
-    MarkovJumpCentralEstimator,
-)
+from fusion_gym.systems.bases import numbered_states
+from fusion_gym.systems.markov_jump import centralised
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
     LagRecursion,
@@ -32,13 +29,12 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import (
 )
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant
 from fusion_gym.systems.markov_jump.system import FadingPlant, MarkovJumpEstimator
-from fusion_gym.systems.parts import numbered_states
 
 _T = 0.5  # the paper's sampling time in seconds
 FILTERS: dict[str, type] = {
     "local": LocalFilters,
-    "centralised": CentralisedLinearFilter,
-    "imm": InteractingModels,
+    "centralised": centralised.CentralisedLinearFilter,
+    "imm": centralised.InteractingModels,
 }
 _ESTIMATES_ALREADY = "packets already carry the nodes' estimates of all measurements"
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("joint covariance",))
@@ -155,7 +151,7 @@ def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
 
 def _estimator(
     where: str, kind: str | None, plant: FadingPlant, weights: Array | None, horizon: int
-) -> MarkovJumpEstimator | MarkovJumpCentralEstimator:
+) -> MarkovJumpEstimator | centralised.MarkovJumpCentralEstimator:
     """Return the estimator of a filter and a fusion rule."""
     model = plant.model
     fusion = _fusion(kind, where, plant.sensor_count, weights)
@@ -166,9 +162,9 @@ def _estimator(
         filters = LocalFilters.create(model, horizon)
         recursion = LagRecursion.create(filters, model.plant.size)
         return MarkovJumpEstimator(*scales, model, filters, recursion, fusion)
-    linear = CentralisedLinearFilter.create(model, horizon)
-    chosen = InteractingModels.create(model) if where == "imm" else linear
-    return MarkovJumpCentralEstimator(*scales, model, chosen, linear.measured(horizon))
+    linear = centralised.CentralisedLinearFilter.create(model, horizon)
+    chosen = centralised.InteractingModels.create(model) if where == "imm" else linear
+    return centralised.MarkovJumpCentralEstimator(*scales, model, chosen, linear.measured(horizon))
 
 
 def _fusion(kind: str | None, where: str, sensors: int, weights: Array | None) -> FusionRule | None:

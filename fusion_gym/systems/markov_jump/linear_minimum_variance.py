@@ -123,10 +123,6 @@ class AugmentedModel:
             squares.append(np.diagonal(step.moment).reshape(-1, self.plant.size).sum(0))
         return np.array(means), np.array(squares)
 
-    def open_loop(self, horizon: int) -> Array:
-        """Return the mean variance (n,) of the state over k = 1..horizon."""
-        return self.scales(horizon)[0]
-
     def scales(self, horizon: int) -> tuple[Array, Array]:
         """Return mean variance (n,) over k = 1..horizon and root mean square (n,) with k = 0."""
         means, squares = self.state_moments(horizon)
@@ -154,9 +150,8 @@ class AugmentedModel:
             means = share @ moved
             apart = moved - means[:, None]
             spreads = phi @ spreads @ phi.swapaxes(1, 2) + driven
-            spreads = np.tensordot(share, spreads, 1) + np.einsum(
-                "mn,mni,mnj->mij", share, apart, apart
-            )
+            between = np.einsum("mn,mni,mnj->mij", share, apart, apart)
+            spreads = np.tensordot(share, spreads, 1) + between
         return np.array(result)
 
 
@@ -306,9 +301,8 @@ def _advance(
 ) -> tuple[dict[str, Array], Array]:
     """Return one time's row of the tables, and the next joint prediction covariance."""
     sensors, transition, faded = model.sensors, model.transition, model.faded
-    own = sensors.fading_variance * np.einsum(
-        "la,ab,lb->l", model.unfaded, step.moment, model.unfaded
-    )
+    square = np.einsum("la,ab,lb->l", model.unfaded, step.moment, model.unfaded)
+    own = sensors.fading_variance * square
     noise = noise + np.diag(own + sensors.variance[:, 0])
     observed = np.einsum("ijab,jb->ija", joint, faded)  # E L_i (c_j L_j)
     innovation = np.einsum("ia,ija->ij", faded, observed) + noise

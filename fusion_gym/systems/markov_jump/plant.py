@@ -113,9 +113,8 @@ class MarkovJumpPlant:
         if radius >= 1.0 - 1e-9:
             raise validation.ConfigurationError(
                 f"transitions = {validation.display(matrices)} are not allowed: with this "
-                "mode_transition "
-                "the plant must be mean-square stable, and the spectral radius of its "
-                f"second-moment operator is {radius:.4g}, which must be < 1"
+                "mode_transition the plant must be mean-square stable, and the spectral radius of "
+                f"its second-moment operator is {radius:.4g}, which must be < 1"
             )
         return plant
 

@@ -15,20 +15,12 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.knowledge import (
-    LOCAL_VARIANCE,
-    Block,
-    Signal,
-    age_block,
-    common_signals,
-    log_deviation,
-    numbered,
-    sensed,
-)
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.namespace import namespace, take
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     AugmentedModel,
     JointPrediction,
@@ -38,7 +30,6 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import (
     Times,
 )
 from fusion_gym.systems.markov_jump.plant import FadingSensors, MarkovJumpPlant, Modes, draw_mode
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 
 _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero right after a packet
 _PER_SENSOR = "(sensors, N)"
@@ -131,7 +122,7 @@ class FadingPlant(SensorPlant[MarkovJumpTruth]):
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
-        return self.model.open_loop(horizon)
+        return self.model.scales(horizon)[0]
 
 
 @dataclass(slots=True)
@@ -162,17 +153,21 @@ class MarkovJumpEstimate(Deliveries):
 
 # What both estimators of the family offer beside the common signals.
 OF_FAMILY = (
-    Signal("centre_variance", "centre", "(N,)", "plain trace of the covariance without a delivery"),
-    Signal(
+    knowledge.Signal(
+        "centre_variance", "centre", "(N,)", "plain trace of the covariance without a delivery"
+    ),
+    knowledge.Signal(
         "greedy_variance",
         "centre",
         _PER_SENSOR,
         "trace if only the sensors before this one in the greedy order transmit",
     ),
-    Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step", "own"),
+    knowledge.Signal(
+        "sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step", "own"
+    ),
 )
 SIGNALS = (
-    *common_signals(
+    *knowledge.common_signals(
         "(sensors, n, N)",
         measurement="the node's new estimate",
         innovation="the node's new estimate minus the centre's copy",
@@ -180,13 +175,13 @@ SIGNALS = (
         expected_measurement="the centre's copy, predicted",
     ),
     *OF_FAMILY,
-    LOCAL_VARIANCE,
+    knowledge.LOCAL_VARIANCE,
 )
 
 
-def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
+def sampling_blocks(sensors: FadingSensors) -> tuple[knowledge.Block, knowledge.Block]:
     """Return the blocks of the observation with the sensors' sampling phases."""
-    own = partial(Block, labels=(numbered(sensors.count),), node="own")
+    own = partial(knowledge.Block, labels=(knowledge.numbered(sensors.count),), node="own")
     since = "steps since the sensor's last sampling time over its period"
     return (
         own(
@@ -213,10 +208,10 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         return self.filters.period
 
     @property
-    def observation(self) -> tuple[Block, ...]:
+    def observation(self) -> tuple[knowledge.Block, ...]:
         """Blocks of the observation."""
-        nodes = numbered(self.model.sensors.count)
-        own, every = partial(Block, node="own", limit=RANGE), (nodes, self.state_names)
+        nodes = knowledge.numbered(self.model.sensors.count)
+        own, every = partial(knowledge.Block, node="own", limit=RANGE), (nodes, self.state_names)
         difference = "node's estimate minus the centre's copy, over its deviation"
         innovation = "node's innovation over its deviation, 0 without a sample"
         local = "logarithm of the root of the node's trace over the open-loop trace"
@@ -224,7 +219,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
             own("whitened_difference", difference, self._difference, every, "own"),
             own("whitened_innovation", innovation, self._whitened_innovation, (nodes,), "own"),
             *sampling_blocks(self.model.sensors),
-            age_block(nodes),
+            knowledge.age_block(nodes),
             own(
                 "local_log_deviation",
                 local,
@@ -250,22 +245,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         noise_mean = np.zeros((count, plant.process_gain.shape[1], runs))
         state_mean = np.broadcast_to(plant.initial_mean, (n, runs)).copy()
         covariance = np.broadcast_to(plant.initial_covariance, (n, n, runs)).copy()
+        nodes, fused = (mean, noise_mean), (state_mean, covariance)
+        time, nothing = np.zeros(runs, dtype=np.int64), np.zeros((count, runs))
+        held, lags = self._collapse(mean), self.recursion.start(runs)
         return MarkovJumpEstimate(
-            time=np.zeros(runs, dtype=np.int64),
-            measurement=measurement,
-            innovation=np.zeros((count, runs)),
-            node_mean=mean,
-            node_noise=noise_mean,
-            copy_mean=mean,
-            copy_noise=noise_mean,
-            held=self._collapse(mean),
-            age=np.zeros((count, runs)),
-            lags=self.recursion.start(runs),
-            prediction=None,
-            prior_mean=state_mean,
-            prior_covariance=covariance,
-            mean=state_mean,
-            covariance=covariance,
+            measurement, held, nothing, time, nothing, *nodes, *nodes, lags, None, *fused, *fused
         )
 
     def predict(self, state: MarkovJumpEstimate) -> MarkovJumpEstimate:
@@ -280,15 +264,13 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         prediction = self.recursion.prediction(lags, place)
         silence = np.zeros(state.age.shape, dtype=np.bool_)
         silent = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(silence))
-        return replace(
-            state,
+        return state.later(
             time=time,
             innovation=np.zeros(state.innovation.shape),
             node_mean=self.filters.predict(state.node_mean, state.node_noise, before),
             node_noise=np.zeros(state.node_noise.shape),
             copy_mean=copy_mean,
             copy_noise=np.zeros(state.copy_noise.shape),
-            age=state.age + 1.0,
             lags=lags,
             prediction=prediction,
             prior_mean=silent.mean,
@@ -314,7 +296,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
 
         Source: markov_jump, equations (34)-(39), (55)-(57).
         """
-        arrived, prediction = reception.arrived, sensed(state.prediction)
+        arrived, prediction = reception.arrived, knowledge.sensed(state.prediction)
         grant, xp = arrived[:, None], namespace(arrived)
         copy_mean = xp.where(grant, state.node_mean, state.copy_mean)
         fused = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(arrived))
@@ -329,7 +311,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
 
     def read(self, state: MarkovJumpEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
-        prediction = sensed(state.prediction)
+        prediction = knowledge.sensed(state.prediction)
         place = self.filters.at(state.time)
         return {
             **super().read(state, failure),
@@ -368,7 +350,7 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
 
     def _difference(self, state: MarkovJumpEstimate) -> Array:
         lag = self._collapse(state.node_mean - state.copy_mean)
-        return lag / self._lag_deviation(sensed(state.prediction))
+        return lag / self._lag_deviation(knowledge.sensed(state.prediction))
 
     def _whitened_innovation(self, state: MarkovJumpEstimate) -> Array:
         nodes, place = np.arange(self.model.sensors.count), self.filters.at(state.time)
@@ -376,11 +358,11 @@ class MarkovJumpEstimator(ScaledEstimator[MarkovJumpEstimate]):
         return state.innovation / namespace(variance).sqrt(variance)
 
     def _local_log_deviation(self, state: MarkovJumpEstimate) -> Array:
-        trace = take(self.recursion.local_trace, self.filters.at(state.time))
-        return log_deviation(trace[:, None, None], self.reference.sum(keepdims=True))[:, 0]
+        trace = take(self.recursion.local_trace, self.filters.at(state.time))[:, None, None]
+        return knowledge.log_deviation(trace, self.reference.sum(keepdims=True))[:, 0]
 
     def _copy_covariance(self, state: MarkovJumpEstimate) -> Array:
-        prediction, nodes = sensed(state.prediction), np.arange(self.model.sensors.count)
+        prediction, nodes = knowledge.sensed(state.prediction), np.arange(self.model.sensors.count)
         return prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:

@@ -21,7 +21,7 @@ from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import TokenBucket, Tokens
 from fusion_gym.declaration import NumpyOnly
 from fusion_gym.errors import forbidden
-from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.remote import vector
 from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
 from fusion_gym.systems.silence import Silence, Trigger
@@ -110,15 +110,9 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
     weights = np.ones(sensors) if chosen is None else chosen
     deviation = validation.positive("noise_deviation", options.noise_deviation, (sensors,))
     coefficient = validation.spread("coefficient", options.coefficient, (sensors,))
-    sources = ScalarSources(
-        state_names=numbered_states(sensors),
-        coefficient=coefficient,
-        deviation=deviation,
-        initial_deviation=validation.not_negative(
-            "initial_deviation", options.initial_deviation, (sensors,)
-        ),
-        nature=_nature(options, coefficient),
-    )
+    initial = validation.not_negative("initial_deviation", options.initial_deviation, (sensors,))
+    law = coefficient, deviation, initial
+    sources = ScalarSources(numbered_states(sensors), *law, _nature(options, coefficient))
     silence = _silence(options, sensors)
     return Scenario(
         options,
@@ -194,9 +188,7 @@ def _error_scale(options: RemoteEstimationOptions, deviation: Array) -> Array:
 
 def _steps(options: RemoteEstimationOptions, sensors: int) -> Array:
     """Return the steps between two packets of a sensor, at least 1, that the network sustains."""
-    bucket, least = (
-        TokenBucket(options, sensors),
-        float(sensors) if options.access != "any" else 1.0,
-    )
+    bucket = TokenBucket(options, sensors)
+    least = float(sensors) if options.access != "any" else 1.0
     steps = 0.0 if bucket.unlimited else bucket.round_cost / np.maximum(bucket.rate, 1e-3)
     return np.maximum(np.ravel(steps), least)

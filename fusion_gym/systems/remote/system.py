@@ -4,7 +4,9 @@ Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop cha
 state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from fusion_gym.core.estimator import Estimator, Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.namespace import namespace
-from fusion_gym.systems.parts import RANGE, Deliveries
+from fusion_gym.systems.bases import RANGE, Deliveries
 from fusion_gym.systems.silence import Silence
 from fusion_gym.systems.solvable import IndependentSources
 
@@ -114,6 +116,15 @@ class RemoteEstimate(Deliveries):
     variance: Array
 
 
+def error_blocks(whose: str, error: Callable[[Any], Array], scale: Array) -> tuple[Block, Block]:
+    """Return the blocks of errors (l, …, N) over ``scale`` (l, …), and of the ages."""
+    labels, constants = tuple(numbered(size) for size in scale.shape), {"error_scale": scale}
+    meaning = f"{whose} minus the centre's prediction, over ``error_scale``"
+    own = partial(Block, knowledge="own", node="own", limit=RANGE, constants=constants)
+    errors = own("error", meaning, lambda s: error(s) / scale[..., None], labels)
+    return errors, age_block(labels[0])
+
+
 SIGNALS = common_signals(
     "(sensors, 1, N)",
     measurement="the source's value",
@@ -168,18 +179,7 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes = numbered(len(self.error_scale))
-        error = Block(
-            "error",
-            "value minus the centre's prediction, over ``error_scale``",
-            lambda s: (s.measurement[:, 0] - s.prior) / self.error_scale[:, None],
-            (nodes,),
-            "own",
-            "own",
-            RANGE,
-            {"error_scale": self.error_scale},
-        )
-        return error, age_block(nodes)
+        return error_blocks("value", lambda s: s.measurement[:, 0] - s.prior, self.error_scale)
 
     def start(self, measurement: Array, announcement: None) -> RemoteEstimate:
         """Return the centre's estimate 0."""
@@ -190,12 +190,8 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
     def predict(self, state: RemoteEstimate) -> RemoteEstimate:
         """Predict the sources."""
         a, sigma = self.model.coefficient[:, None], self.model.deviation[:, None]
-        return replace(
-            state,
-            prior=a * state.mean,
-            prior_variance=a * a * state.variance + sigma * sigma,
-            age=state.age + 1.0,
-        )
+        variance = a * a * state.variance + sigma * sigma
+        return state.later(prior=a * state.mean, prior_variance=variance)
 
     def update(self, state: RemoteEstimate, reception: Reception) -> RemoteEstimate:
         """Replace the centre's prediction where a packet arrives."""
@@ -233,9 +229,7 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
             "innovation": lambda: state.measurement - state.prior[:, None],
             "held": state.held[:, None],
             "expected_measurement": state.prior[:, None],
-            "innovation_deviation": lambda: namespace(state.prior_variance).sqrt(
-                state.prior_variance
-            )[:, None],
+            "innovation_deviation": lambda: state.prior_variance[:, None] ** 0.5,
             "prior_mean": state.prior,
             "prior_covariance": lambda: _diagonal(state.prior_variance),
             "silent_variance": lambda: linalg.total(

@@ -13,11 +13,12 @@ from scipy.linalg import LinAlgError, block_diag, solve_discrete_are
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, Reception, SignalValues
-from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
+from fusion_gym.core.knowledge import Block, common_signals
 from fusion_gym.core.plant import Nature, true_motion, true_noise
 from fusion_gym.errors import forbidden
 from fusion_gym.namespace import namespace
-from fusion_gym.systems.parts import RANGE, Deliveries, NormalPlant, Truth, numbered_states
+from fusion_gym.systems.bases import Deliveries, NormalPlant, Truth, numbered_states
+from fusion_gym.systems.remote.system import error_blocks
 from fusion_gym.systems.solvable import AgedSources
 
 KEYS = ("transition", "process_covariance", "measurement_matrix", "measurement_covariance")
@@ -302,35 +303,21 @@ class VectorEstimator(Estimator[VectorEstimate]):
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        count, size = self.error_scale.shape
-        error = Block(
-            "error",
-            "node's estimate minus the centre's prediction, over ``error_scale``",
-            lambda s: (s.node_mean - s.prior) / self.error_scale[..., None],
-            (numbered(count), numbered(size)),
-            "own",
-            "own",
-            RANGE,
-            {"error_scale": self.error_scale},
-        )
-        return error, age_block(numbered(count))
+        return error_blocks("node's estimate", lambda s: s.node_mean - s.prior, self.error_scale)
 
     def start(self, measurement: Array, announcement: None) -> VectorEstimate:
         """Return estimates 0 with the nodes' steady covariance."""
         runs, xp = measurement.shape[-1], namespace(measurement)
         nothing = xp.zeros((*self.error_scale.shape, runs))
-        blocks = xp.array(
-            np.broadcast_to(self.model.posterior, (*nothing.shape[:2], *nothing.shape[1:]))
-        )
+        shape = (*nothing.shape[:2], *nothing.shape[1:])
+        blocks = xp.array(np.broadcast_to(self.model.posterior, shape))
         age = xp.zeros((len(nothing), runs))
         return VectorEstimate(measurement, nothing, age, nothing, nothing, nothing, blocks, blocks)
 
     def predict(self, state: VectorEstimate) -> VectorEstimate:
         """Predict at the nodes and at the centre."""
         transition = self.model.transition
-        return replace(
-            state,
-            age=state.age + 1.0,
+        return state.later(
             node_mean=linalg.matvec(transition, state.node_mean),
             prior=linalg.matvec(transition, state.mean),
             prior_blocks=self.model.predict_covariance(state.blocks),

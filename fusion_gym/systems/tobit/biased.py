@@ -22,15 +22,15 @@ from fusion_gym.core.access import AccessRule
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import Tokens
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import numbered_states
-from fusion_gym.systems.tobit import system
+from fusion_gym.systems.tobit import centres, system
 from fusion_gym.systems.tobit.filters import TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
-_FILTERS = {"paper": system.at_the_nodes(TobitKalmanFilter), **system.FILTERS}
+_FILTERS = {"paper": centres.at_the_nodes(TobitKalmanFilter), **centres.FILTERS}
 _PERIOD = 0.1  # seconds between two samples of the tracking example
 # Observed variances are relative to those after so many silent steps: over a whole episode the
 # target, a double integrator of a random walk, drifts thousands of times as far as it is known.
@@ -60,7 +60,7 @@ class BiasedOscillatorOptions(system.FeedbackOptions):
         (2, 'single', 100)
     """
 
-    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = centres.classes(_FILTERS)
     transition: ArrayLike = ((_COS, -_SIN), (_SIN, _COS))
     """A of equation (1), (n, n)."""
     process_covariance: ArrayLike = ((0.0025, 0.0), (0.0, 0.0025))
@@ -148,9 +148,8 @@ def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
     horizon = validation.horizon(options.horizon)
     plant, states = _augmented(options, aware=True)
     model = plant if options.bias_aware else _augmented(options, aware=False)[0]
-    matrices = validation.array(
-        "measurement_matrices", options.measurement_matrices, (None, None, states)
-    )
+    shape = (None, None, states)
+    matrices = validation.array("measurement_matrices", options.measurement_matrices, shape)
     sensors = CensoredSensors.create(
         np.pad(matrices, ((0, 0), (0, 0), (0, plant.size - states))),
         options.measurement_variance,
@@ -160,15 +159,12 @@ def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
     )
     biases = plant.size - states
     own = ("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))
+    names = numbered_states(states) + own
     return system.feedback_scenario(
         options,
         _FILTERS,
-        plant,
-        sensors,
-        numbered_states(states) + own,
+        system.CensoredPlant(plant, sensors, names, options.random_start),
         _REFERENCE_HORIZON,
-        memory_filter=options.memory_filter,
-        random_start=options.random_start,
         model=model,
         state_weights=equal_weights(plant.open_loop(horizon)),
     )

@@ -1,8 +1,9 @@
-"""Nodes and fusion centres: from prediction and deliveries to the fused estimate."""
+"""Nodes and fusion centres, from prediction and deliveries to the fused estimate, by filter."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, cast
 
@@ -13,6 +14,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.fusion.rules import FusionRule
+from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.namespace import active_rows, namespace
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.silence import Silence
@@ -21,13 +23,16 @@ from fusion_gym.systems.tobit.filters import (
     Expectation,
     KalmanFilter,
     NodeFilter,
-    Outcomes,
+    StochasticEventFilter,
     joint_update,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 Gaussian = tuple[Array, Array]  # mean (…, n, N) and covariance (…, n, n, N)
 Packets = NDArray[np.bool_]
+STRUCTURE = Structure(
+    common="all nodes start from the same prediction", holds=("information shares",)
+)
 _MOST_CHANNELS = 100  # whose joint covariance is solved in every step
 _ROUNDS = 2  # a third changes errors by less than a thousandth
 _LEAST_SHARE = 1e-9  # of a variance; the rest of the difference is rounding
@@ -47,7 +52,7 @@ class Prediction(NamedTuple):
     deviation: Array
     root: Array
     prior: Gaussian
-    outcomes: Outcomes | None = None
+    outcomes: Any = None
     held: Any = None
     moment: Any = None
     possible: Any = None
@@ -61,6 +66,7 @@ class Centre(Protocol):
         reads_silence: Whether a step without a delivery is information.
         traceable: Whether JAX traces the methods.
         predicts: Whether a step without a delivery only predicts, by A x̂.
+        predictable: Whether the covariances depend on the deliveries only.
     """
 
     filter: Any
@@ -68,6 +74,7 @@ class Centre(Protocol):
     reads_silence: ClassVar[bool] = False
     traceable: ClassVar[bool] = True
     predicts: ClassVar[bool] = False
+    predictable: ClassVar[bool] = False
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -80,11 +87,6 @@ class Centre(Protocol):
         if sensors is self.sensors:
             return self
         return replace(cast(Any, self), filter=replace(self.filter, sensors=sensors))
-
-    @property
-    def predictable(self) -> bool:
-        """Whether the covariances depend on the deliveries only."""
-        return False
 
     def advance(self, model: LinearPlant, state: Any) -> Prediction:
         """Return the prediction one step after a state's delivery."""
@@ -168,7 +170,7 @@ class NodeCentre(Centre):
         return self.filter.predicts
 
     @property
-    def predictable(self) -> bool:
+    def predictable(self) -> bool:  # type: ignore[override]
         """See :class:`Centre`; true for Kalman filters of uncensored sensors."""
         return type(self.filter) is KalmanFilter and self.sensors.unlimited
 
@@ -199,7 +201,7 @@ class FeedbackCentre(NodeCentre):
 
     def update(self, prediction: Prediction, measurement: Array, granted: Packets) -> Gaussian:
         """See :class:`Centre`; each node uses its planned outcome of a grant or of silence."""
-        outcomes, root, share = _outcomes(prediction), prediction.root, self.share[:, None]
+        outcomes, root, share = prediction.outcomes, prediction.root, self.share[:, None]
         both = outcomes.delivered_covariance, outcomes.silent_covariance
         own = namespace(granted).where(granted[:, None, None], *both)
         local = self._shift(prediction, measurement, granted)
@@ -214,7 +216,7 @@ class FeedbackCentre(NodeCentre):
 
     def _shift(self, prediction: Prediction, measurement: Array, granted: Packets) -> Array:
         """Return the nodes' means (sensors, n, N) of z."""
-        outcomes = _outcomes(prediction)
+        outcomes = prediction.outcomes
         innovation = measurement - prediction.expectation.value
         delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
         local = namespace(granted).where(granted[:, None], delivered, outcomes.silent_mean)
@@ -223,7 +225,7 @@ class FeedbackCentre(NodeCentre):
 
     def variances(self, prediction: Prediction, weights: Array) -> tuple[Array, Array]:
         """See :class:`Centre`; a filter that minimises a bound uses the bound."""
-        outcomes, root = _outcomes(prediction), prediction.root
+        outcomes, root = prediction.outcomes, prediction.root
         share = self.share[:, None, None]
         covariances = outcomes.silent_covariance / share, outcomes.delivered_covariance / share
         silent, single = (
@@ -362,12 +364,6 @@ def _shifted(prediction: Prediction, matrix: Array, value: Array) -> Gaussian:
     return prediction.prior[0] + linalg.matvec(root, shift), linalg.congruence(root, covariance)
 
 
-def _outcomes(prediction: Prediction) -> Outcomes:
-    if prediction.outcomes is None:
-        raise RuntimeError("the prediction has no outcomes: another centre made it")
-    return prediction.outcomes
-
-
 @dataclass(frozen=True)
 class JointCentre(FederatedCentre):
     r"""Kalman filter at the centre, of all deliveries of a step, without nodes.
@@ -418,10 +414,11 @@ class JointCentre(FederatedCentre):
     local_means = Centre.local_means
 
 
-def joint_centre(sensors: CensoredSensors) -> JointCentre:
+def joint_centre(options: Any, sensors: CensoredSensors) -> JointCentre:
     """Return the centre of ``filter="joint"``.
 
     Args:
+        options: options of the environment, of which none matters.
         sensors: the sensors.
 
     Raises:
@@ -681,3 +678,72 @@ def truncated_centre(options: Any, sensors: CensoredSensors) -> TruncatedCentre:
         raise refusal("filter", "truncated", allowed)
     silence = Silence.create(options, sensors.count, sensors.size)
     return TruncatedCentre(KalmanFilter(sensors), np.ones((sensors.count, 1)), silence)
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A row of a table of filters: its class, and the function that makes its centre.
+
+    The docstring of ``kind`` has meaning, equation, assumption and source. ``own`` are options of
+    this filter only; for other filters they are ``None``.
+    """
+
+    kind: type
+    make: Callable[[Any, CensoredSensors], Centre]
+    own: tuple[str, ...] = ()
+
+    @property
+    def nodes(self) -> bool:
+        """Whether the filter has nodes; without nodes the options of their fusion are ``None``."""
+        return issubclass(self.kind, NodeFilter)
+
+
+def at_the_nodes(kind: Any) -> Filter:
+    """Return the row of a node filter without options of its own."""
+    return Filter(kind, lambda options, sensors: feedback_centre(options, kind(sensors)))
+
+
+def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
+    """Return the class of each filter of a table."""
+    return {name: row.kind for name, row in filters.items()}
+
+
+def feedback_centre(options: Any, node: NodeFilter) -> Centre:
+    """Return nodes with this filter and the options' fusion.
+
+    Args:
+        options: options of the environment.
+        node: the nodes' filter.
+
+    Raises:
+        ConfigurationError: a rule that does not fit, or an option of another rule.
+    """
+    sensors = node.sensors.count
+    kind = "federated" if options.fusion is None else options.fusion
+    weights = options.own_weights(node.sensors.measurement_matrix.shape[2])
+    fusion = choose_rule(kind, STRUCTURE, sensors, options.order, weights)
+    if kind == "federated":
+        share = information_shares(options.information_shares, sensors)
+        if isinstance(node, KalmanFilter):
+            return FederatedCentre(node, share)
+        return FeedbackCentre(node, share, fusion)
+    if (given := options.information_shares) is not None:
+        reason = "it belongs to fusion='federated'"
+        raise forbidden("information_shares", given, reason, f"with fusion={kind!r}")
+    return FeedbackCentre(node, np.ones((sensors, 1)), fusion)
+
+
+# What every environment of the family offers; each adds its paper's own.
+FILTERS = {
+    "kalman": at_the_nodes(KalmanFilter),
+    "adf": Filter(
+        AssumedDensityFilter, lambda _, sensors: SequentialCentre(AssumedDensityFilter(sensors))
+    ),
+    "stochastic": Filter(
+        StochasticEventFilter,
+        lambda options, sensors: feedback_centre(
+            options, StochasticEventFilter.create(sensors, options.stochastic_weight)
+        ),
+        own=("stochastic_weight",),
+    ),
+}

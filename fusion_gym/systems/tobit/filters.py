@@ -15,7 +15,6 @@ is K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter update
 
 from __future__ import annotations
 
-import functools
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -531,9 +530,8 @@ class BoundConstants:
         Raises:
             ConfigurationError: another number of entries, or an entry <= 0.
         """
-        e = validation.positive(
-            "bound_epsilon", validation.array("bound_epsilon", epsilon, (14,)), (14,)
-        )
+        given = validation.array("bound_epsilon", epsilon, (14,))
+        e = validation.positive("bound_epsilon", given, (14,))
         kappa = (
             1 + e[0] + e[1] + e[2] + e[3] + e[4],
             1 + 1 / e[0] + 1 / e[6] + 1 / e[9] + 1 / e[11] + 1 / e[12],
@@ -564,16 +562,11 @@ class EventError:
 
     def at(self, time: Array) -> Array:
         """Return Ξ(G_{t-1}) (sensors, N) at the steps t = ``time`` (N,), counted from 1."""
-        xp, (rate, logarithm) = namespace(time), self._growth_rate
+        xp, rate = namespace(time), self.growth - 1.0
+        logarithm = np.log1p(rate)  # exact also where the growth is nearly 1
         ramp = xp.expm1(logarithm * time) / np.where(rate, rate, 1.0)
         ramp = xp.where(rate == 0.0, time, ramp)
         return self.initial * xp.exp(logarithm * time) + self.offset * ramp
-
-    @functools.cached_property
-    def _growth_rate(self) -> tuple[Array, Array]:
-        """Growth - 1 and the growth's logarithm, exact also where the growth is nearly 1."""
-        rate = self.growth - 1.0
-        return rate, np.log1p(rate)
 
     @classmethod
     def create(

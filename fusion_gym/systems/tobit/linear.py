@@ -14,19 +14,11 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Scenario
 from fusion_gym.declaration import NumpyOnly, plain_options
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import numbered_states
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 from fusion_gym.systems.silence import Trigger
-from fusion_gym.systems.tobit import system
-from fusion_gym.systems.tobit.centres import (
-    HoldCentre,
-    JointCentre,
-    TruncatedCentre,
-    hold_centre,
-    joint_centre,
-    truncated_centre,
-)
+from fusion_gym.systems.tobit import centres, system
 from fusion_gym.systems.tobit.filters import TobitKalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
@@ -40,18 +32,17 @@ _REFERENCE_HORIZON = 10
 
 
 _FILTERS = {
-    "kalman": system.FILTERS["kalman"],
-    "tobit": system.at_the_nodes(TobitKalmanFilter),
-    "adf": system.FILTERS["adf"],
-    "stochastic": system.FILTERS["stochastic"],
-    "joint": system.Filter(JointCentre, lambda _, sensors: joint_centre(sensors), nodes=False),
-    "hold": system.Filter(
-        HoldCentre,
-        lambda options, sensors: hold_centre(sensors, _system(options)[0]),
-        nodes=False,
+    "kalman": centres.FILTERS["kalman"],
+    "tobit": centres.at_the_nodes(TobitKalmanFilter),
+    "adf": centres.FILTERS["adf"],
+    "stochastic": centres.FILTERS["stochastic"],
+    "joint": centres.Filter(centres.JointCentre, centres.joint_centre),
+    "hold": centres.Filter(
+        centres.HoldCentre,
+        lambda options, sensors: centres.hold_centre(sensors, _system(options)[0]),
     ),
-    "truncated": system.Filter(
-        TruncatedCentre, truncated_centre, own=("trigger", "trigger_threshold"), nodes=False
+    "truncated": centres.Filter(
+        centres.TruncatedCentre, centres.truncated_centre, own=("trigger", "trigger_threshold")
     ),
 }
 # Observed variances are relative to those after so many silent steps: a target that nobody sees
@@ -94,7 +85,7 @@ class LinearFusionOptions(system.FeedbackOptions):
         (1, ('x1',))
     """
 
-    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = centres.classes(_FILTERS)
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
     """A of x(t+1) = A x(t) + w(t), (n, n)."""
     process_covariance: ArrayLike = ((_STEP**3 / 3.0, _STEP**2 / 2.0), (_STEP**2 / 2.0, _STEP))
@@ -168,17 +159,15 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     scenario = system.feedback_scenario(
         choice,
         _FILTERS,
-        plant,
-        sensors,
-        _names(choice.state_names, plant.size),
+        system.CensoredPlant(plant, sensors, _names(choice.state_names, plant.size)),
         _REFERENCE_HORIZON,
-        memory_filter="kalman" if holds and choice.memory_filter is None else choice.memory_filter,
+        memory_filter="kalman" if holds else None,
         known_start=True,
         no_estimates=_HELD if holds else None,
         required_policy=choice.trigger,
     )
     centre = cast(Any, scenario.estimator).centre
-    if isinstance(centre, TruncatedCentre):
+    if isinstance(centre, centres.TruncatedCentre):
         scenario.policy_defaults.update(centre.silence.policy_defaults)
     return scenario
 
@@ -257,7 +246,7 @@ def _matrices(value: Any, states: int) -> list[Array]:
     result = []
     for place, item in enumerate(validation.entries("measurement_matrices", value, "a matrix")):
         name = f"measurement_matrices[{place}]"
-        row = _dimensions(item) == 1
+        row = len(validation.array_shape(item) or ()) == 1
         matrix = validation.array(name, item, (states,) if row else (None, states))
         result.append(matrix[None] if row else matrix)
     return result
@@ -265,7 +254,7 @@ def _matrices(value: Any, states: int) -> list[Array]:
 
 def _each(name: str, value: Any, kind: str, sensors: int) -> list[tuple[str, Any]]:
     """Return field and value of each sensor, from one number for all or one entry for each."""
-    if _dimensions(value) == 0:
+    if validation.array_shape(value) == ():
         return [(name, value)] * sensors
     entries = validation.entries(name, value, kind, count=sensors)
     return [(f"{name}[{place}]", entry) for place, entry in enumerate(entries)]
@@ -275,7 +264,7 @@ def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
     each = _each("measurement_covariances", values, "a covariance or a variance", len(sizes))
     result = []
     for size, (full, value) in zip(sizes, each, strict=True):
-        if _dimensions(value) == 0:
+        if validation.array_shape(value) == ():
             value = validation.number(full, value, at_least=validation.SMALLEST**2) * np.eye(size)
         result.append(validation.covariance(full, value, size, definite=True))
     return result
@@ -288,16 +277,6 @@ def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
     for place, (size, (full, value)) in enumerate(zip(sizes, each, strict=True)):
         result[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
     return result
-
-
-def _dimensions(value: Any) -> int:
-    """Return the depth of a nested value, by its first entries."""
-    if isinstance(value, np.ndarray):
-        return value.ndim
-    depth = 0
-    while isinstance(value, (list, tuple)):
-        depth, value = depth + 1, value[0] if value else 0.0
-    return depth + (value.ndim if isinstance(value, np.ndarray) else 0)
 
 
 def _names(value: Any, states: int) -> tuple[str, ...]:

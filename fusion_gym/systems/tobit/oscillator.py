@@ -18,15 +18,9 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.task import Scenario
 from fusion_gym.core.token_bucket import SharingRule
+from fusion_gym.systems.bases import numbered_states, trigger_parameters
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.parts import numbered_states, trigger_parameters
-from fusion_gym.systems.tobit import system
-from fusion_gym.systems.tobit.filters import (
-    BoundConstants,
-    BoundTobitFilter,
-    EventError,
-    TobitKalmanFilter,
-)
+from fusion_gym.systems.tobit import centres, filters, system
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _ANGLE = 0.052 * math.pi
@@ -36,12 +30,12 @@ _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
 _HELD = "the silent filter continues from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
-    "paper": system.Filter(
-        BoundTobitFilter,
-        lambda options, sensors: system.feedback_centre(options, _bound_filter(options, sensors)),
+    "paper": centres.Filter(
+        filters.BoundTobitFilter,
+        lambda options, sensors: centres.feedback_centre(options, _bound_filter(options, sensors)),
     ),
-    "tobit": system.at_the_nodes(TobitKalmanFilter),
-    **system.FILTERS,
+    "tobit": centres.at_the_nodes(filters.TobitKalmanFilter),
+    **centres.FILTERS,
 }
 
 
@@ -72,7 +66,7 @@ class TobitOscillatorOptions(system.FeedbackOptions):
         (3, ('x1', 'x2'))
     """
 
-    filters: ClassVar[Mapping[str, type]] = system.classes(_FILTERS)
+    filters: ClassVar[Mapping[str, type]] = centres.classes(_FILTERS)
     transition: ArrayLike = ((_COS, _SIN), (-_SIN, _COS))
     """A of equation (1), (n, n). By default a rotation by 0.052 π."""
     process_noise: Literal["scalar", "full"] = "scalar"
@@ -139,21 +133,15 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
                 f"{name} = {refused!r} is not allowed with filter={options.filter!r}: it belongs "
                 "to filter='paper' (the others predict in silence, without an event error)"
             )
-    memory_filter = options.memory_filter
-    if memory_filter is None and options.filter == "paper":
-        # The paper's minimises a bound; with every measurement it errs thrice.
-        memory_filter = "adf"
     holds = options.filter == "paper" and options.silent != "predict"
     return system.feedback_scenario(
         options,
         _FILTERS,
-        plant,
-        sensors,
-        numbered_states(plant.size),
+        system.CensoredPlant(plant, sensors, numbered_states(plant.size), options.random_start),
         horizon,
-        memory_filter=memory_filter,
+        # The paper's minimises a bound; with every measurement it errs thrice.
+        memory_filter="adf" if options.filter == "paper" else None,
         policy_defaults={"dynamic_event": trigger},
-        random_start=options.random_start,
         no_estimates=_HELD if holds else None,
     )
 
@@ -172,22 +160,22 @@ def _plant(options: TobitOscillatorOptions) -> LinearPlant:
     )
 
 
-def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
+def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> filters.NodeFilter:
     """Return the paper's filter, with its constants and the trigger's Ξ."""
-    constants = BoundConstants.create(options.bound_epsilon)
+    constants = filters.BoundConstants.create(options.bound_epsilon)
     if np.min(options.bound_epsilon) < _SMALLEST_EPSILON:
         allowed = f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound"
         raise validation.refusal("bound_epsilon", options.bound_epsilon, allowed)
     trigger = _trigger(options, sensors.count)
-    error = EventError.create(trigger, options.bound_young, sensors.count)
+    error = filters.EventError.create(trigger, options.bound_young, sensors.count)
     with_error = options.event_error is None or options.event_error
     hold = options.silent != "predict"
     if with_error and options.filter == "paper":
         _refuse_explosion(options, error)
-    return BoundTobitFilter(sensors, constants, error if with_error else None, hold=hold)
+    return filters.BoundTobitFilter(sensors, constants, error if with_error else None, hold=hold)
 
 
-def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> None:
+def _refuse_explosion(options: TobitOscillatorOptions, error: filters.EventError) -> None:
     """Refuse a horizon over which the bound of the event error overflows."""
     reached = error.at(np.array([float(options.horizon)]))
     if not np.all(reached <= _LARGEST_EVENT_ERROR):

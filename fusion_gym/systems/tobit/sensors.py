@@ -86,9 +86,8 @@ class CensoredSensors(Sensors):
             reason = f"each must be below censoring_upper = {validation.display(high)}"
             raise forbidden("censoring_threshold", low, reason)
         uncensored = np.isneginf(low)
-        noise = validation.positive(
-            "measurement_variance", variance, shape, validation.SMALLEST**2
-        )[..., None]
+        least = validation.SMALLEST**2
+        noise = validation.positive("measurement_variance", variance, shape, least)[..., None]
         here = np.ones(shape) if present is None else np.where(present, 1.0, 0.0)
         return cls(
             measurement_matrix=matrix[..., None],

@@ -7,7 +7,7 @@ round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, NamedTuple, cast
@@ -23,49 +23,27 @@ from fusion_gym.core.plant import AS_ASSUMED, Nature, Plant, true_noise
 from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.declaration import plain_options
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
-from fusion_gym.fusion.table import Structure, choose_rule
+from fusion_gym.fusion.table import Structure
 from fusion_gym.namespace import namespace
-from fusion_gym.systems import parts
-from fusion_gym.systems.linear_plant import (
-    LinearPlant,
-    largest_ratio,
-    typical_magnitude,
-    variance_loss,
-)
+from fusion_gym.systems import bases, linear_plant
 from fusion_gym.systems.solvable import LinearEstimator, LinearProblem, ParametricEstimator
-from fusion_gym.systems.tobit.centres import (
-    Centre,
-    FederatedCentre,
-    FeedbackCentre,
-    Prediction,
-    SequentialCentre,
-    information_shares,
-)
-from fusion_gym.systems.tobit.filters import (
-    AssumedDensityFilter,
-    KalmanFilter,
-    NodeFilter,
-    StochasticEventFilter,
-)
+from fusion_gym.systems.tobit.centres import STRUCTURE, Centre, Filter, NodeCentre, Prediction
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import choice
 
 _TINY = float(np.finfo(float).tiny)  # stands for a variance of zero
 _OF_FUSION = ("fusion", "information_shares", "order")
-_STRUCTURE = Structure(
-    common="all nodes start from the same prediction", holds=("information shares",)
-)
 
 
 @dataclass(frozen=True)
-class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
+class CensoredPlant(bases.SensorPlant[bases.Truth], bases.NormalPlant):
     """A linear plant and censored sensors.
 
     ``random_start`` draws the direction of the initial mean uniformly and announces it. For the
     oscillator that is a random phase. ``nature`` is the departure of the truth from this model.
     """
 
-    dynamics: LinearPlant
+    dynamics: linear_plant.LinearPlant
     sensors: CensoredSensors
     state_names: tuple[str, ...]
     random_start: bool = False
@@ -98,7 +76,7 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
                 result[state] = (min(before[0], ends[0]), max(before[1], ends[1]))
         return result
 
-    def start(self, noise: Array) -> tuple[parts.Truth, Any]:
+    def start(self, noise: Array) -> tuple[bases.Truth, Any]:
         """Draw the initial state, and announce its mean (n, N)."""
         n = self.dynamics.size
         noise, departure = self.nature.begin(noise)
@@ -111,9 +89,9 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
         own = true_noise(departure, noise[:0], noise[2 * n :])[1]
         time = xp.zeros(runs)
         measurement = self.sensors.at(time).measure(truth, own, departure)
-        return parts.Truth(truth, measurement, departure, time), mean
+        return bases.Truth(truth, measurement, departure, time), mean
 
-    def sense(self, state: parts.Truth, noise: Array) -> parts.Truth:
+    def sense(self, state: bases.Truth, noise: Array) -> bases.Truth:
         """Move the plant, and measure.
 
         Source: tobit_token_bucket, equations (1) and (2).
@@ -122,15 +100,15 @@ class CensoredPlant(parts.SensorPlant[parts.Truth], parts.NormalPlant):
         process, own = true_noise(departure, noise[:r], noise[r:])
         truth = self.dynamics.at(state.time).advance(state.truth, process, departure)
         measurement = self.sensors.at(time).measure(truth, own, departure)
-        return parts.Truth(truth, measurement, departure, time)
+        return bases.Truth(truth, measurement, departure, time)
 
     def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`Plant`."""
         every = self.sensors.each_step
         rows = np.moveaxis(every.measurement_matrix / every.deviation[:, :, None], -1, 0)
         moments = self.dynamics.second_moments(horizon, self.random_start)
-        loss = variance_loss(self.dynamics, horizon, self._packets)
-        return largest_ratio(moments, rows), loss
+        loss = linear_plant.variance_loss(self.dynamics, horizon, self._packets)
+        return linear_plant.largest_ratio(moments, rows), loss
 
     def _packets(self, time: int) -> Iterator[tuple[Array, Array]]:
         """Yield matrices and noises of the single packets of a time, then of all together."""
@@ -170,7 +148,7 @@ class DailyLevel:
 
 
 @dataclass(slots=True)
-class CensoredEstimate(parts.Deliveries):
+class CensoredEstimate(bases.Deliveries):
     """The estimate of N runs at one time; n states.
 
     ``time`` (N,), the step in the episode · ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N),
@@ -201,7 +179,7 @@ _SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a re
 
 @dataclass(frozen=True)
 class CensoredEstimator(
-    parts.AdoptingEstimator[CensoredEstimate],
+    bases.AdoptingEstimator[CensoredEstimate],
     LinearEstimator[CensoredEstimate],
     ParametricEstimator[CensoredEstimate],
 ):
@@ -213,7 +191,7 @@ class CensoredEstimator(
     from it, and a measurement of NaN is a gap.
     """
 
-    model: LinearPlant
+    model: linear_plant.LinearPlant
     centre: Centre
     state_names: tuple[str, ...]
     scale: Array
@@ -282,7 +260,7 @@ class CensoredEstimator(
             result["process_covariance"] = model.process_covariance[..., 0]
         if sensors.schedule is None:
             result["measurement_variance"] = sensors.variance[..., 0]
-        if isinstance(self.centre, (FederatedCentre, FeedbackCentre)):
+        if isinstance(self.centre, NodeCentre):
             result["information_shares"] = self.centre.share[:, 0]
         return result
 
@@ -308,7 +286,7 @@ class CensoredEstimator(
         sensors = self.centre.sensors
         nodes = numbered(sensors.count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
-        new = partial(own, knowledge="own", limit=parts.RANGE)
+        new = partial(own, knowledge="own", limit=bases.RANGE)
         at_threshold = "whether the component is at its threshold"
         uncensored = "predicted probability that the component is not censored"
         divisor, unit = 2.0 * sensors.deviation, "two noise deviations"
@@ -330,8 +308,8 @@ class CensoredEstimator(
                 lambda s: sensed(s.prediction).expectation.uncensored_probability,
             ),
             age_block(nodes),
-            parts.variance_block(self._log_variance, self.state_names, self.reference),
-            parts.prior_block(self.state_names, self.scale),
+            bases.variance_block(self._log_variance, self.state_names, self.reference),
+            bases.prior_block(self.state_names, self.scale),
         ]
         if sensors.unlimited:  # these two would say nothing
             blocks = [block for block in blocks if block.name not in _OF_CENSORING]
@@ -344,17 +322,8 @@ class CensoredEstimator(
             mean, day = announcement
         (n, runs), sensors, xp = mean.shape, self.centre.sensors, namespace(mean)
         covariance = xp.array(np.broadcast_to(self.model.initial_covariance, (n, n, runs)))
-        first = CensoredEstimate(
-            measurement=measurement,
-            held=measurement,
-            age=np.zeros((sensors.count, runs)),
-            time=np.zeros(runs),
-            prior_mean=mean,
-            prior_covariance=covariance,
-            prediction=None,
-            mean=mean,
-            covariance=covariance,
-            day=day,
+        first = CensoredEstimate.begin(
+            measurement, np.zeros(runs), mean, covariance, None, mean, covariance, day
         )
         if not self.known_start:
             return first
@@ -382,7 +351,7 @@ class CensoredEstimator(
         prediction = centre.advance(model, state)
         mean, covariance = prediction.prior
         state = replace(state, prior_mean=mean, prior_covariance=covariance, prediction=prediction)
-        return replace(state, age=state.age + 1.0, time=time)
+        return state.later(time=time)
 
     def observe(self, state: CensoredEstimate, measurement: Array) -> CensoredEstimate:
         """See :class:`Estimator`; a sensor without a reading has the expectation."""
@@ -478,8 +447,8 @@ def _whitened(state: CensoredEstimate) -> Array:
 class FeedbackOptions(PaperOptions):
     """Options of the fusion and its feedback; ``None`` is the default of the filter or the rule."""
 
-    structure: ClassVar[Structure | None] = _STRUCTURE
-    fusion: Annotated[str | None, _STRUCTURE.offered] = None
+    structure: ClassVar[Structure | None] = STRUCTURE
+    fusion: Annotated[str | None, STRUCTURE.offered] = None
     """Rule that joins the nodes' estimates, by default ``"federated"`` (tobit_token_bucket,
     equations (50) and (51)). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for
     two sensors. ``"sci"`` and ``"sici"`` join two estimates at a time."""
@@ -493,43 +462,15 @@ class FeedbackOptions(PaperOptions):
     inverse squared unit of the measurement. ``filter="stochastic"`` needs it."""
 
 
-@dataclass(frozen=True)
-class Filter:
-    """A row of a table of filters: its class, and the function that makes its centre.
-
-    The docstring of ``kind`` has meaning, equation, assumption and source. ``own`` are options of
-    this filter only; for other filters they are ``None``. ``nodes`` says whether the filter has
-    nodes; without nodes the options of their fusion are ``None``.
-    """
-
-    kind: type
-    make: Callable[[Any, CensoredSensors], Centre]
-    own: tuple[str, ...] = ()
-    nodes: bool = True
-
-
-def at_the_nodes(kind: Any) -> Filter:
-    """Return the row of a node filter without options of its own."""
-    return Filter(kind, lambda options, sensors: feedback_centre(options, kind(sensors)))
-
-
-def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
-    """Return the class of each filter of a table."""
-    return {name: row.kind for name, row in filters.items()}
-
-
 def feedback_scenario(
     options: Any,
     filters: Mapping[str, Filter],
-    plant: LinearPlant,
-    sensors: CensoredSensors,
-    state_names: tuple[str, ...],
+    truth: CensoredPlant,
     reference_horizon: int,
     *,
-    memory_filter: str | None,
+    memory_filter: str | None = None,
     policy_defaults: Mapping[str, dict[str, Any]] | None = None,
-    random_start: bool = False,
-    model: LinearPlant | None = None,
+    model: linear_plant.LinearPlant | None = None,
     known_start: bool = False,
     **others: Any,
 ) -> Scenario:
@@ -541,14 +482,11 @@ def feedback_scenario(
     Args:
         options: options of the environment.
         filters: the table of filters.
-        plant: the true plant.
-        sensors: the sensors.
-        state_names: names of the states.
+        truth: the true plant and its sensors, without a departure from the model.
         reference_horizon: steps without transmissions whose variances scale observed variances.
-        memory_filter: name of the memory's filter, or None for the same filter.
+        memory_filter: default of the option ``memory_filter``, or None for the same filter.
         policy_defaults: parameters of policies.
-        random_start: whether the initial mean has a random direction.
-        model: the plant that the filters assume, by default ``plant``.
+        model: the plant that the filters assume, by default the true one.
         known_start: whether the estimate begins with the first measurement of every sensor.
         **others: other fields of the scenario.
 
@@ -556,6 +494,7 @@ def feedback_scenario(
         ConfigurationError: an unknown filter, an option of another filter, or a departure of the
             truth that is not allowed or has no effect.
     """
+    plant, sensors, names = truth.dynamics, truth.sensors, truth.state_names
     kind = choice("filter", options.filter, filters)
     where = f"filter={kind!r}"
     for name, row in filters.items():
@@ -571,74 +510,33 @@ def feedback_scenario(
     nature = Nature.create(options, (*plant.unmoved, *absent))
     nature.check_growth(plant.true_radius, options.horizon)
     if plant.schedule is None and sensors.schedule is None:
-        plant.warn_of_unseen_growth(sensors.stacked_matrix, state_names)
+        plant.warn_of_unseen_growth(sensors.stacked_matrix, names)
     estimator = CensoredEstimator(
         model=plant if model is None else model,
         centre=centre,
-        state_names=state_names,
-        scale=typical_magnitude(plant, options.horizon, random_start),
+        state_names=names,
+        scale=linear_plant.typical_magnitude(plant, options.horizon, truth.random_start),
         reference=plant.open_loop(min(options.horizon, reference_horizon)),
         known_start=known_start,
     )
-    memory = None
-    if memory_filter is not None:
-        row = filters[choice("memory_filter", memory_filter, filters)]
+    memory, own = None, options.memory_filter
+    if (other := memory_filter if own is None else own) is not None:
+        row = filters[choice("memory_filter", other, filters)]
         changed: dict[str, Any] = dict.fromkeys(() if row.nodes else _OF_FUSION)
-        changed["filter"] = memory_filter
+        changed["filter"] = other
         memory = replace(estimator, centre=row.make(replace(options, **changed), sensors))
     defaults: dict[str, Any] = dict(policy_defaults or {})
     if options.stochastic_weight is not None:
         defaults["stochastic_event"] = {"weight": plain_options(options.stochastic_weight)}
     return Scenario(
         options,
-        CensoredPlant(plant, sensors, state_names, random_start, nature),
+        replace(truth, nature=nature),
         estimator,
         policy_defaults=defaults,
         feedback=True,
         memory_estimator=memory,
         **others,
     )
-
-
-def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
-    """Return nodes with this filter and the options' fusion.
-
-    Args:
-        options: options of the environment.
-        node: the nodes' filter.
-
-    Raises:
-        ConfigurationError: a rule that does not fit, or an option of another rule.
-    """
-    sensors = node.sensors.count
-    kind = "federated" if options.fusion is None else options.fusion
-    weights = options.own_weights(node.sensors.measurement_matrix.shape[2])
-    fusion = choose_rule(kind, _STRUCTURE, sensors, options.order, weights)
-    if kind == "federated":
-        share = information_shares(options.information_shares, sensors)
-        if isinstance(node, KalmanFilter):
-            return FederatedCentre(node, share)
-        return FeedbackCentre(node, share, fusion)
-    _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
-    return FeedbackCentre(node, np.ones((sensors, 1)), fusion)
-
-
-# What every environment of the family offers; each adds its paper's own.
-FILTERS = {
-    "kalman": at_the_nodes(KalmanFilter),
-    "adf": Filter(
-        AssumedDensityFilter,
-        lambda _, sensors: SequentialCentre(AssumedDensityFilter(sensors)),
-        nodes=False,
-    ),
-    "stochastic": Filter(
-        StochasticEventFilter,
-        lambda options, sensors: feedback_centre(
-            options, StochasticEventFilter.create(sensors, options.stochastic_weight)
-        ),
-        own=("stochastic_weight",),
-    ),
-}
 
 
 def _refuse(options: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:

@@ -22,17 +22,14 @@ from fusion_gym.core.task import PaperOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.errors import forbidden, refusal
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.parts import numbered_states
+from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.unknown_input import filters
 from fusion_gym.systems.unknown_input.nodes import NodeFusion, Nodes, RunNodes, TableNodes
 from fusion_gym.systems.unknown_input.plant import (
-    ArrayInput,
+    SHAPE,
     InputSensors,
-    InputSignal,
-    MeanRevertingWalk,
-    Sinusoids,
-    Steps,
     UnknownInputPlant,
+    make_signal,
 )
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 
@@ -122,7 +119,6 @@ EXAMPLES = _examples()
 
 
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
-_SHAPE = ("input_amplitude", "input_period", "input_phase")  # of a signal by its name
 Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
@@ -234,7 +230,7 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
     options = _with_example(choice)
     horizon = validation.horizon(options.horizon)
     plant = UnknownInputPlant.create(options)
-    signal = _signal(options, plant.inputs, horizon)
+    signal = make_signal(options, plant.inputs, horizon)
     sensors = InputSensors.create(options, plant)
     trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
@@ -251,13 +247,8 @@ def build_unknown(choice: UnknownInputOptions) -> Scenario:
     names = _state_names(options, plant)
     plant.warn_of_unseen_growth(sensors.measurement_matrix, names)
     truth = DrivenPlant(plant, signal, sensors, names, nature)
-    estimator = UnknownInputEstimator(
-        nodes=_nodes(options, plant, sensors, horizon),
-        state_names=names,
-        state_weights=weights,
-        magnitude=plant.magnitude(signal, horizon),
-        reference=open_loop,
-    )
+    scales = names, weights, plant.magnitude(signal, horizon), open_loop
+    estimator = UnknownInputEstimator(*scales, _nodes(options, plant, sensors, horizon))
     # The paper's filter minimises a bound; its memory has the random walk's.
     kind, memory = options.memory_filter, None
     if kind is None and options.filter == "paper":
@@ -316,30 +307,11 @@ def _with_example(options: UnknownInputOptions) -> Any:
     kind = options.input_signal
     if isinstance(kind, str):
         validation.choice("input_signal", kind, get_args(Signal))
-        numbers |= zip(_SHAPE, example["signals"][kind], strict=True)
+        numbers |= zip(SHAPE, example["signals"][kind], strict=True)
     if options.transition is not None or options.initial_mean is not None:
         numbers.pop("initial_half_width", None)
     missing = {name: value for name, value in numbers.items() if getattr(options, name) is None}
     return replace(options, **missing)
-
-
-def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
-    kind = options.input_signal
-    shape = {name: getattr(options, name) for name in _SHAPE}
-    if not isinstance(kind, str):
-        for name, value in shape.items():
-            if value is not None:
-                raise refusal(name, value, "None", "with an array as input_signal")
-        return ArrayInput.create(inputs, kind, horizon)
-    amplitude, period, phase = shape.values()
-    if kind == "sinusoids":
-        return Sinusoids.create(inputs, amplitude, period, phase)
-    if not (isinstance(phase, str) and phase == "random"):
-        reason = "phases belong to 'sinusoids'"
-        raise forbidden("input_phase", phase, reason, f"with input_signal={kind!r}")
-    if kind == "steps":
-        return Steps.create(inputs, amplitude, period)
-    return MeanRevertingWalk.create(inputs, amplitude, period)
 
 
 def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizon: int) -> Nodes:
@@ -375,12 +347,10 @@ def _nodes(options: Any, plant: UnknownInputPlant, sensors: InputSensors, horizo
 def _trigger(options: Any, sensors: int) -> dict[str, tuple[float, ...]]:
     """Return the parameters of the adaptive threshold trigger, one number per sensor."""
     names = ("rho_bar", "rho_initial", "adaptation")
-    spread = {
-        name: tuple(validation.spread(name, getattr(options, name), (sensors,)).tolist())
-        for name in names
-    }
-    validation.adaptive_thresholds(*spread.values())
-    return spread
+    each = [validation.spread(name, getattr(options, name), (sensors,)) for name in names]
+    values = [tuple(own.tolist()) for own in each]
+    validation.adaptive_thresholds(*values)
+    return dict(zip(names, values, strict=True))
 
 
 def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Array:
@@ -388,10 +358,8 @@ def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Arr
     chosen = options.own_weights(len(open_loop))
     if chosen is not None:
         return chosen
-    share = np.ones(len(open_loop))
-    share[len(share) - inputs :] = validation.number(
-        "input_weight", options.input_weight, at_least=0.0
-    )
+    share, weight = np.ones(len(open_loop)), options.input_weight
+    share[len(share) - inputs :] = validation.number("input_weight", weight, at_least=0.0)
     return share / (share.sum() * open_loop)
 
 

@@ -375,9 +375,8 @@ class BoundTables:
                 f"below 1, not {radius[sensor]:.4g}; use a smaller factor, another sensor, or "
                 "filter='random_walk'"
             )
-        start = np.broadcast_to(
-            model.initial_covariance, (count, *model.initial_covariance.shape)
-        ).copy()
+        initial = model.initial_covariance
+        start = np.broadcast_to(initial, (count, *initial.shape)).copy()
         gains = [np.zeros((*joint.onto.shape[:3], 1))]
         covariances, delivered = [start], [start]
         for _ in range(times):

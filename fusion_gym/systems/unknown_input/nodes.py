@@ -18,12 +18,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.fusion import several
 from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
-from fusion_gym.fusion.several import (
-    CovarianceIntersection,
-    covariance_intersection_many,
-    is_regular,
-)
 from fusion_gym.namespace import in_runs, namespace, put_runs, set_at, take
 from fusion_gym.systems.unknown_input.filters import (
     BoundTables,
@@ -45,7 +41,7 @@ class NodeFusion(FusionRule):
     ``rule`` joins the ``states`` n entries of the nodes' states, and their inputs. With
     :class:`~fusion_gym.fusion.several.CovarianceIntersection` and ``tracked``, its weights follow
     the smallest trace from one time to the next (:func:`tracked_intersection`), starting from the
-    weights of :meth:`going_on`.
+    last ``weights`` (l, N).
 
     Covariance intersection gives a bound for every correlation of the nodes' errors, provided that
     the nodes' covariances are bounds. Its inverse form does not, because the errors share process
@@ -57,14 +53,6 @@ class NodeFusion(FusionRule):
     tracked: bool = False
     state_weights: Array | None = None
     weights: Array | None = None
-
-    def start(self, nodes: int, runs: int) -> Array | None:
-        """Return equal weights (l, N) if weights are tracked."""
-        return np.full((nodes, runs), 1.0 / nodes) if self.tracked else None
-
-    def going_on(self, weights: Array | None) -> NodeFusion:
-        """Return the rule that starts from the last weights (l, N)."""
-        return self if weights is None else replace(self, weights=weights)
 
     def fuse(
         self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
@@ -104,7 +92,7 @@ class NodeFusion(FusionRule):
         if len(means) == 1:
             identity = linalg.identity(means.shape[1]) * ones
             return Fused(means[0], own[0], lambda: identity[None], ones)
-        if isinstance(rule, CovarianceIntersection):
+        if isinstance(rule, several.CovarianceIntersection):
             if means.shape[1] == 1:
                 return _smallest_variance(means, own)
             if self.weights is not None:
@@ -131,7 +119,7 @@ def tracked_intersection(
     w_i Y_i)⁻¹, until the trace of P is within 1 % of its minimum: the gap is at most max_i tr(P Y_i
     P) - tr P. A call makes at most four evaluations; the next call continues. Every P is a bound,
     since any weights give one. For a nearly singular estimate the search is
-    :func:`covariance_intersection_many`.
+    :func:`~fusion_gym.fusion.several.covariance_intersection_many`.
 
     Args:
         mean: (l, n, N).
@@ -169,10 +157,10 @@ def tracked_intersection(
         moved = xp.maximum(some * xp.sqrt(gain), _FLOOR**2)
         weights = put_runs(weights, lanes, moved / linalg.total(moved, 0))
     joined = linalg.matvec(fused, linalg.total(weights[:, None] * vectors, 0))
-    singular: Any = ~is_regular(covariance, information).all(0)
+    singular: Any = ~several.is_regular(covariance, information).all(0)
 
     def best(mean: Array, covariance: Array, basis: Array | None = None) -> tuple[Any, ...]:
-        found = covariance_intersection_many(mean, covariance, basis=basis)
+        found = several.covariance_intersection_many(mean, covariance, basis=basis)
         return found.mean, found.covariance, found.weights, found.gains
 
     arguments = (mean, covariance) if basis is None else (mean, covariance, basis)
@@ -195,9 +183,9 @@ class Estimates(NamedTuple):
 
     mean: Array
     fused_mean: Array
-    covariance: Array | None
-    fused_covariance: Array | None
-    weights: Array | None
+    covariance: Any = None
+    fused_covariance: Any = None
+    weights: Array | None = None
 
 
 class NodePrediction(NamedTuple):
@@ -210,12 +198,15 @@ class NodePrediction(NamedTuple):
     mean: Array
     fused_mean: Array
     expected: Array
-    covariance: Array | None
+    covariance: Any
 
 
 @dataclass(frozen=True)
 class _Nodes:
-    """What both kinds of nodes have: the model of plant and input, and the sensors."""
+    """What both kinds of nodes have: the model of plant and input, and the sensors.
+
+    A ``state`` below is the estimator's, with the last deliveries, the new ones included.
+    """
 
     model: InputModel
     sensors: InputSensors
@@ -227,10 +218,12 @@ class _Nodes:
         mean = np.broadcast_to(fused, (self.sensors.count, *fused.shape)).copy()
         return mean, fused, np.broadcast_to(initial, (*fused.shape[:1] * 2, runs)).copy()
 
-    def _predict(self, estimates: Estimates, covariance: Array | None) -> NodePrediction:
-        """Return predictions with these covariances (l, s, s, N) of the nodes."""
-        xp = namespace(estimates.mean)
+    def predict(self, estimates: Estimates) -> NodePrediction:
+        """Return the predictions for the next measurements."""
+        xp, covariance = namespace(estimates.mean), estimates.covariance
         prior = self.model.predict(xp.concatenate((estimates.mean, estimates.fused_mean[None])))
+        if covariance is not None:
+            covariance = self.model.predict_covariance(covariance)
         return NodePrediction(prior[:-1], prior[-1], self.sensors.expect(prior[:-1]), covariance)
 
 
@@ -266,46 +259,28 @@ class TableNodes(_Nodes):
                 unit[node, entry] = 1.0
                 result = fusion.fuse(unit, tables.covariance)
                 gains[node, :, entry], fused = result.mean, result.covariance
-        return cls(
-            model=model,
-            sensors=sensors,
-            tables=tables,
-            state_gain=gains[:, :n, :n],
-            input_gain=gains[:, n:, n:],
-            fused=fused,
-            delivered=fusion.fuse_single(tables.covariance, tables.delivered)[1],
-            prior=model.predict_covariance(np.roll(tables.covariance, 1, axis=-1)),
-        )
+        delivered = fusion.fuse_single(tables.covariance, tables.delivered)[1]
+        prior = model.predict_covariance(np.roll(tables.covariance, 1, axis=-1))
+        both = gains[:, :n, :n], gains[:, n:, n:]
+        return cls(model, sensors, tables, *both, fused, delivered, prior)
 
     def start(self, runs: int) -> Estimates:
         """Return the estimates before any measurement; covariances stay in the tables."""
         mean, fused, _ = self._start(runs)
-        return Estimates(mean, fused, None, None, None)
+        return Estimates(mean, fused)
 
-    def predict(self, estimates: Estimates) -> NodePrediction:
-        """Return the predictions for the next measurements."""
-        return self._predict(estimates, None)
-
-    def update(
-        self,
-        estimates: Estimates,
-        prediction: NodePrediction,
-        held: Array,
-        granted: NDArray[np.bool_],
-        time: Array,
-    ) -> Estimates:
+    def update(self, state: Any, granted: NDArray[np.bool_]) -> Estimates:
         """Update every node with the held measurement (l, m, N) as the present one.
 
         Source: unknown_input, equations (8), (24).
         """
-        gain = self._at(self.tables.gain, time)
-        mean = prediction.mean + linalg.matvec(gain, held - prediction.expected)
-        n = self.model.size
-        state = linalg.matvec(self._at(self.state_gain, time), mean[:, :n])
-        inputs = linalg.matvec(self._at(self.input_gain, time), mean[:, n:])
-        parts = linalg.total(state, 0), linalg.total(inputs, 0)
-        fused = namespace(mean).concatenate(parts)
-        return Estimates(mean, fused, None, None, None)
+        prediction, n = state.prediction, self.model.size
+        gain = self._at(self.tables.gain, state.time)
+        mean = prediction.mean + linalg.matvec(gain, state.held - prediction.expected)
+        states = linalg.matvec(self._at(self.state_gain, state.time), mean[:, :n])
+        inputs = linalg.matvec(self._at(self.input_gain, state.time), mean[:, n:])
+        parts = linalg.total(states, 0), linalg.total(inputs, 0)
+        return Estimates(mean, namespace(mean).concatenate(parts))
 
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
         """Return the table's entry; at time 0, without a prediction, it has no meaning."""
@@ -315,16 +290,14 @@ class TableNodes(_Nodes):
         """Return the bound (s, s, N), which holds if the trigger keeps |σ|² <= ρ̄."""
         return self._at(self.fused, time)
 
-    def variances(
-        self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
-    ) -> tuple[Array, Array]:
+    def variances(self, state: Any, weights: Array) -> tuple[Array, Array]:
         """Return the bound's trace (N,), weighted by (s,), and its reductions (l, N).
 
         A reduction supposes that one held difference is zero.
         """
         silent = linalg.weighted_trace(self.fused, weights)
         reduction = silent - linalg.weighted_trace(self.delivered, weights)
-        rows = self._rows(time)
+        rows = self._rows(state.time)
         return take(silent, rows), take(reduction, rows)
 
     def _rows(self, time: Array) -> NDArray[np.intp]:
@@ -356,78 +329,53 @@ class RunNodes(_Nodes):
         """Return the estimates before any measurement, equal for all nodes."""
         mean, fused, covariance = self._start(runs)
         every = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape)).copy()
-        weights = self.fusion.start(self.sensors.count, runs)
+        weights = np.full((len(mean), runs), 1.0 / len(mean)) if self.fusion.tracked else None
         return Estimates(mean, fused, every, covariance, weights)
 
-    def predict(self, estimates: Estimates) -> NodePrediction:
-        """Return the predictions for the next measurements."""
-        prior = self.model.predict_covariance(_own(estimates.covariance))
-        return self._predict(estimates, prior)
-
-    def update(
-        self,
-        estimates: Estimates,
-        prediction: NodePrediction,
-        held: Array,
-        granted: NDArray[np.bool_],
-        time: Array,
-    ) -> Estimates:
-        """Update granted nodes, predict (or hold) the others, and fuse all.
-
-        ``held`` (l, m, N) are the last deliveries with the new ones.
-        """
-        gain, covariance = self._outcome(estimates, prediction, granted)
-        correction = linalg.matvec(gain, held - prediction.expected)
+    def update(self, state: Any, granted: NDArray[np.bool_]) -> Estimates:
+        """Update granted nodes, predict (or hold) the others, and fuse all."""
+        prediction, (gain, covariance) = state.prediction, self._outcome(state, granted)
+        correction = linalg.matvec(gain, state.held - prediction.expected)
         if self.hold_variance is None:
             grant = granted[:, None]
             correction *= grant
-            own = _own(prediction.covariance)
-            covariance = namespace(granted).where(grant[:, None], covariance, own)
+            prior = prediction.covariance
+            covariance = namespace(granted).where(grant[:, None], covariance, prior)
         mean = prediction.mean + correction
-        fused = self.fusion.going_on(estimates.weights).fuse(mean, covariance)
+        fusion = replace(self.fusion, weights=state.estimates.weights)
+        fused = fusion.fuse(mean, covariance)
         return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)
 
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
         """Return the runs' own covariances (l, s, s, N)."""
-        return _own(prediction.covariance)
+        return prediction.covariance
 
     def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
         """Return the centre's covariance (s, s, N)."""
-        return _own(estimates.fused_covariance)
+        return estimates.fused_covariance
 
-    def variances(
-        self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
-    ) -> tuple[Array, Array]:
+    def variances(self, state: Any, weights: Array) -> tuple[Array, Array]:
         """Return a silent step's fused trace (N,), weighted by (s,), and its reductions (l, N).
 
         The fusion has the best weights.
         """
-        nobody = np.zeros((self.sensors.count, prediction.expected.shape[-1]), dtype=np.bool_)
-        silent = _own(prediction.covariance)
+        nobody, silent = np.zeros(state.age.shape, dtype=np.bool_), state.prediction.covariance
         if self.hold_variance is not None:
-            silent = self._outcome(estimates, prediction, nobody)[1]
-        delivered = self._outcome(estimates, prediction, ~nobody)[1]
+            silent = self._outcome(state, nobody)[1]
+        delivered = self._outcome(state, ~nobody)[1]
         together, single = self.fusion.fuse_single(silent, delivered)
         start = linalg.weighted_trace(together, weights)
         return start, start - linalg.weighted_trace(single, weights)
 
-    def _outcome(
-        self, estimates: Estimates, prediction: NodePrediction, granted: NDArray[np.bool_]
-    ) -> tuple[Array, Array]:
+    def _outcome(self, state: Any, granted: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return gain (l, s, m, N) and covariance (l, s, s, N) of an update."""
         noise = self.sensors.covariance
         if isinstance(self.filter, ExactInputStateFilter):
-            return self.filter.update(_own(estimates.covariance), noise)
+            return self.filter.update(state.estimates.covariance, noise)
         if self.hold_variance is not None:
             extra = self.hold_variance * ~granted[:, None, None]
             noise = noise + linalg.identity(self.sensors.size) * extra
-        return self.filter.update(_own(prediction.covariance), noise)
+        return self.filter.update(state.prediction.covariance, noise)
 
 
 Nodes = TableNodes | RunNodes
-
-
-def _own(value: Array | None) -> Array:
-    if value is None:
-        raise RuntimeError("these estimates belong to nodes that share their covariances")
-    return value

@@ -19,10 +19,12 @@ from numpy.typing import ArrayLike
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.plant import true_motion
+from fusion_gym.errors import forbidden, refusal
 from fusion_gym.namespace import namespace, ndtr, take
 from fusion_gym.systems.linear_plant import LinearDynamics, Sensors, covariance_factor, initial_law
 
 _LONGEST_PERIOD = 1000  # small steps between two instants
+SHAPE = ("input_amplitude", "input_period", "input_phase")  # of a signal by its name
 _RANK = 1e-8  # singular values below this share of what they could be count as zero
 
 
@@ -278,6 +280,35 @@ class ArrayInput(InputSignal):
     def mean(self, horizon: int) -> Array:
         """Return the rows (horizon, q)."""
         return self.values[np.minimum(np.arange(horizon), len(self.values) - 1), :, 0]
+
+
+def make_signal(options: Any, inputs: int, horizon: int) -> InputSignal:
+    """Return the signal of an environment's options.
+
+    Args:
+        options: ``input_signal``, a name or an array, and the options ``SHAPE`` of a name.
+        inputs: number of inputs q.
+        horizon: steps of an episode.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, or does not belong to this signal.
+    """
+    kind = options.input_signal
+    shape = {name: getattr(options, name) for name in SHAPE}
+    if not isinstance(kind, str):
+        for name, value in shape.items():
+            if value is not None:
+                raise refusal(name, value, "None", "with an array as input_signal")
+        return ArrayInput.create(inputs, kind, horizon)
+    amplitude, period, phase = shape.values()
+    if kind == "sinusoids":
+        return Sinusoids.create(inputs, amplitude, period, phase)
+    if not (isinstance(phase, str) and phase == "random"):
+        reason = "phases belong to 'sinusoids'"
+        raise forbidden("input_phase", phase, reason, f"with input_signal={kind!r}")
+    if kind == "steps":
+        return Steps.create(inputs, amplitude, period)
+    return MeanRevertingWalk.create(inputs, amplitude, period)
 
 
 @dataclass(frozen=True)

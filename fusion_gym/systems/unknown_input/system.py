@@ -16,8 +16,8 @@ from fusion_gym.core import knowledge
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_noise
 from fusion_gym.namespace import namespace, ndtr
+from fusion_gym.systems.bases import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.linear_plant import largest_ratio
-from fusion_gym.systems.parts import RANGE, Deliveries, ScaledEstimator, SensorPlant, Truth
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
 from fusion_gym.systems.unknown_input.plant import InputSensors, InputSignal, UnknownInputPlant
 
@@ -64,13 +64,10 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         noise, departure = self.nature.begin(noise)
         state = self.dynamics.start(noise[:n])
         first = true_noise(departure, noise[:0], noise[n : n + count])[1]
-        return UnknownInputTruth(
-            truth=namespace(noise).concatenate((state, np.zeros((self.dynamics.inputs, runs)))),
-            signal=self.signal.start(noise[n + count :]),
-            time=np.zeros(runs),
-            measurement=self.sensors.measure(state, first),
-            departure=departure,
-        ), None
+        truth = namespace(noise).concatenate((state, np.zeros((self.dynamics.inputs, runs))))
+        measurement = self.sensors.measure(state, first)
+        signal = self.signal.start(noise[n + count :])
+        return UnknownInputTruth(truth, measurement, departure, np.zeros(runs), signal), None
 
     def sense(self, state: UnknownInputTruth, noise: Array) -> UnknownInputTruth:
         """Move the plant under the input for one interval, and measure.
@@ -83,13 +80,10 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         process, own = true_noise(departure, noise[drawn : drawn + r], noise[drawn + r :])
         last = state.truth[: self.dynamics.size]
         moved = self.dynamics.advance(last, inputs, process, departure)
-        return replace(
-            state,
-            truth=namespace(moved, inputs).concatenate((moved, inputs)),
-            signal=self.signal.advance(state.signal, noise[:drawn]),
-            time=state.time + 1.0,
-            measurement=self.sensors.measure(moved, own),
-        )
+        truth = namespace(moved, inputs).concatenate((moved, inputs))
+        measurement = self.sensors.measure(moved, own)
+        signal = self.signal.advance(state.signal, noise[:drawn])
+        return UnknownInputTruth(truth, measurement, departure, state.time + 1.0, signal)
 
     @property
     def draw_channels(self) -> int | None:
@@ -125,13 +119,9 @@ class DrivenPlant(SensorPlant[UnknownInputTruth]):
         gained = linalg.solve(spread, linalg.transpose(cross))
         left = linalg.symmetrise(covariance[:n, :n] - linalg.matmul(cross, gained))
         moved = mean[:n] + linalg.matvec(linalg.transpose(gained), off)
-        return UnknownInputTruth(
-            truth=np.concatenate((linalg.draw_normal(moved, left, first), mean[n:] + off)),
-            signal=self.signal.advance(memory, moving),
-            time=time,
-            measurement=measurement,
-            departure=None,
-        )
+        truth = np.concatenate((linalg.draw_normal(moved, left, first), mean[n:] + off))
+        signal = self.signal.advance(memory, moving)
+        return UnknownInputTruth(truth, measurement, None, time, signal)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean squared error (n + q,) over k = 1..horizon of a prediction with d = 0."""
@@ -220,28 +210,20 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
     def start(self, measurement: Array, announcement: None) -> UnknownInputEstimate:
         """Return equal estimates; every first measurement is known without charge."""
         runs = measurement.shape[-1]
-        return UnknownInputEstimate(
-            measurement=measurement,
-            held=measurement,
-            age=np.zeros((self.nodes.sensors.count, runs)),
-            time=np.zeros(runs),
-            estimates=self.nodes.start(runs),
-            prediction=None,
-        )
+        return UnknownInputEstimate.begin(measurement, np.zeros(runs), self.nodes.start(runs), None)
 
     def predict(self, state: UnknownInputEstimate) -> UnknownInputEstimate:
         """Predict at the nodes."""
-        prediction = self.nodes.predict(state.estimates)
-        return replace(state, age=state.age + 1.0, time=state.time + 1.0, prediction=prediction)
+        return state.later(time=state.time + 1.0, prediction=self.nodes.predict(state.estimates))
 
     def update(self, state: UnknownInputEstimate, reception: Reception) -> UnknownInputEstimate:
         """Update the nodes with the measurements that arrive, and fuse.
 
         Source: unknown_input, equations (8), (24), (25).
         """
-        prediction, arrived = knowledge.sensed(state.prediction), reception.arrived
-        after = state.after(arrived)
-        estimates = self.nodes.update(state.estimates, prediction, after.held, arrived, state.time)
+        knowledge.sensed(state.prediction)
+        after = state.after(reception.arrived)
+        estimates = self.nodes.update(after, reception.arrived)
         return replace(after, estimates=estimates)
 
     def read(self, state: UnknownInputEstimate, failure: Array | None = None) -> SignalValues:
@@ -251,7 +233,7 @@ class UnknownInputEstimator(ScaledEstimator[UnknownInputEstimate]):
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
-            return self.nodes.variances(state.estimates, prediction, self.state_weights, state.time)
+            return self.nodes.variances(state, self.state_weights)
 
         return {
             **super().read(state, failure),

@@ -11,7 +11,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.solvers.silence.model import silence_model
+from fusion_gym.solvers.silence.problem import silence_model
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

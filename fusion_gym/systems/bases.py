@@ -1,4 +1,4 @@
-"""What plants and estimators of several families share: states, channels, blocks."""
+"""Base classes of states, plants and estimators, and blocks that several families share."""
 
 from __future__ import annotations
 
@@ -58,6 +58,16 @@ class Deliveries:
     measurement: Array
     held: Array
     age: Array
+
+    @classmethod
+    def begin(cls, measurement: Array, *fields: Any) -> Self:
+        """Return the state at time 0 from measurements that are delivered, and the other fields."""
+        age = np.zeros((len(measurement), measurement.shape[-1]))
+        return cls(measurement, measurement, age, *fields)
+
+    def later(self, **changes: Any) -> Self:
+        """Return the state one step later, with changes of other fields."""
+        return replace(self, age=self.age + 1.0, **changes)
 
     def after(self, arrived: NDArray[np.bool_], sent: Array | None = None, **changes: Any) -> Self:
         """Return the state after packets (l, N), with changes of other fields.
