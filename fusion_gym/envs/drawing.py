@@ -171,12 +171,11 @@ class Film:
             band = axis.fill_between(
                 [], [], [], color=_ESTIMATE, alpha=0.18, lw=0, label="± 2 claimed deviations"
             )
-            low, high = limits.get(place, (-np.inf, np.inf))
-            if np.isfinite(low):
-                axis.axhspan(-1e9, low, color=_CENSORED, alpha=0.15, lw=0, label="censored")
-            if np.isfinite(high):
-                label = None if np.isfinite(low) else "censored"
-                axis.axhspan(high, 1e9, color=_CENSORED, alpha=0.15, lw=0, label=label)
+            for end, beyond in zip(limits.get(place, ()), (-1e9, 1e9), strict=False):
+                if np.isfinite(end):
+                    axis.axhspan(
+                        *sorted((end, beyond)), color=_CENSORED, alpha=0.15, lw=0, label="censored"
+                    )
             axis.set_ylabel(name)
             (whole,) = axis.plot([], [], color=_TRUTH, lw=1.0, alpha=0.3)
             self._curves.append([truth, mean, band, whole])

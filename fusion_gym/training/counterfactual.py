@@ -297,7 +297,8 @@ class Counterfactual(OnPolicyAlgorithm):
         if not self._decisions.local:
             return self._value(observation)
         # One by one, because the rows of all alternatives would not fit into the cache.
-        return np.stack([self._value(self._decisions.visible_rows(item)) for item in observation])
+        rows = map(self._decisions.view.rows, observation)
+        return np.stack([self._value(self._decisions.by_run(item)) for item in rows])
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
         """Return the masks of the runs' decisions, for an algorithm with masks."""
@@ -408,10 +409,6 @@ class Decisions:
     def by_run(self, rows: Any) -> Any:
         """Return local rows (rows, entries) by run (runs, sensors, entries); others unchanged."""
         return rows.reshape(-1, self.sensors, rows.shape[-1]) if self.local else rows
-
-    def visible_rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the local views (runs, sensors, entries) of observations (runs, entries)."""
-        return self.by_run(self.view.rows(observation))
 
     def actions(self, choice: Choices) -> NDArray[Any]:
         """Return the actions of the rows from the choices (runs, D)."""
