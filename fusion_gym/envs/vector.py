@@ -142,7 +142,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         mask = self._reset_mask(options)
         runs = np.flatnonzero(mask)
         self.batch.seed(runs, [seeds[run] for run in runs])
-        self._begin(None if mask.all() else runs)
+        self._begin(runs)
         self._started |= mask
         infos = step_infos(reset_outcome(self.task, self.num_envs))
         return self.batch.observe(), _with_mask(infos, mask)
@@ -153,8 +153,8 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
             return None
         return tuple(self._film.frame(run) for run in range(self.num_envs))
 
-    def _begin(self, runs: NDArray[np.int64] | None) -> None:
-        """Begin new episodes in ``runs``, or with ``None`` in all."""
+    def _begin(self, runs: NDArray[np.int64]) -> None:
+        """Begin new episodes in ``runs``."""
         self.batch.reset(runs)
         if self._film is not None:
             self._film.begin(runs)

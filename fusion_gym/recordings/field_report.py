@@ -97,14 +97,9 @@ def card_row(card: ChannelCard) -> tuple[str, ...]:
 
 
 DeviceName = Literal["zigbee", "bacnet", "esphome"]
-# Shortest and longest interval in seconds, and the meaning of the fields with its source.
-DEVICES: dict[str, tuple[float, float, str]] = {
-    "zigbee": (1.0, 65_534.0, "whole seconds, and steps of the attribute MeasuredValue "
-               "(Zigbee Cluster Library, Configure Reporting)"),
-    "bacnet": (1.0, 4_294_967_295.0, "COV_Increment in the object's unit, and seconds after which "
-               "the centre subscribes again (ANSI/ASHRAE 135, SubscribeCOV)"),
-    "esphome": (0.001, 4_294_967.0, "filters of the sensor; a delta must be exceeded "
-                "(ESPHome, Sensor Filters)"),
+# Shortest and longest interval in seconds.
+DEVICES = {
+    "zigbee": (1.0, 65_534.0), "bacnet": (1.0, 4_294_967_295.0), "esphome": (0.001, 4_294_967.0),
 }  # fmt: skip
 _TEMPERATURE = "Temperature Measurement 0x0402", 0.01, 32_767
 _HUMIDITY = "Relative Humidity 0x0405", 0.01, 65_535
@@ -129,7 +124,7 @@ def longest_interval(device: DeviceName, seconds: float) -> int:
     Raises:
         ConfigurationError: the device cannot hold one step.
     """
-    low, high, _ = DEVICES[device]
+    low, high = DEVICES[device]
     if not low <= seconds <= high:
         allowed = f"a device with an interval of {seconds:g} s, not from {low:g} to {high:g} s"
         raise refusal("device", device, allowed)
@@ -163,21 +158,6 @@ def fields_of(
     steps = round(change / step) if step else f"{change:g} in unknown steps"
     intervals = {"minimum_reporting_interval": int(least), "maximum_reporting_interval": int(most)}
     return {"cluster": cluster, "reportable_change": steps, **intervals}
-
-
-_CHANGE = "Sensors report on change"
-MEANINGS = {
-    PRACTICE: f"{_CHANGE}, with one scale of all thresholds; the centre holds the last reading.",
-    "practice, one a sensor": f"{_CHANGE}, each with its own threshold; the centre holds the last "
-    "reading.",
-    "silence ignored, one a sensor": f"{_CHANGE}, each with its own threshold; the centre has a "
-    "Kalman filter.",
-    "silence used": f"{_CHANGE}, with one scale of all thresholds; the centre uses silence.",
-    "silence used, one a sensor": f"{_CHANGE}, each with its own threshold; the centre uses "
-    "silence.",
-    "centralised": "Value of information: a scheduler sees all readings.",
-    "agent": "Counterfactual PPO: a scheduler sees all readings.",
-}
 
 
 @dataclass(frozen=True)
@@ -227,24 +207,22 @@ def write_report(report: FieldReport, folder: Path) -> str:
         loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         keep_trailing_newline=True,
     )  # fmt: skip
-    template = templates.get_template("report.md")
     functions = card_lines, criticism_rows, device_table, results_table, table, tolerance_table
     values = {function.__name__: function for function in functions} | {
         "report": report, "study": report.study, "version": __version__, "devices": devices,
         "best": next((row for row in report.results if row.name == best), None),
-        "practice": PRACTICE, "filter": METHODS[best][0], "meanings": MEANINGS,
-        "methods": [(name, MEANINGS[name]) for name in report.points],
-        "fields": report.device and DEVICES[report.device][2],
+        "practice": PRACTICE, "filter": METHODS[best][0],
         "seconds": report.recording.interval.total_seconds(), "ratios": RATIOS,
         "columns": COLUMNS, "cards": [card_row(card) for card in report.whole.card],
     }  # fmt: skip
-    markdown = template.render(values)
+    rendered = templates.get_template("report.md").make_module(values)
+    markdown = str(rendered)
     page = MarkdownIt("commonmark").enable("table").render(markdown)
     html = templates.get_template("report.html").render(name=report.name, page=page)
     write_text(folder / "report.md", markdown)
     write_text(folder / "report.html", html)
     write_text(folder / "devices.yaml", devices)
-    return "".join(template.blocks["summary"](template.new_context(values))).rstrip()
+    return str(vars(rendered)["summary"]).rstrip()
 
 
 def tolerance_table(report: FieldReport) -> str:
