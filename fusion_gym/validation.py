@@ -5,6 +5,7 @@ Every check returns the value in the library's form (float64 arrays, Python ints
 """
 
 import copy
+import operator
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -105,8 +106,9 @@ def number(
     at_most: float | None = None,
 ) -> float:
     """Return a finite real number within the limits."""
-    limits = {">": above, ">=": at_least, "<=": at_most}
-    listed = " and ".join(f"{sign} {limit}" for sign, limit in limits.items() if limit is not None)
+    limits = (">", operator.gt, above), (">=", operator.ge, at_least), ("<=", operator.le, at_most)
+    given = [(sign, within, limit) for sign, within, limit in limits if limit is not None]
+    listed = " and ".join(f"{sign} {limit}" for sign, _, limit in given)
     allowed = f"a finite number {listed}".rstrip()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise refusal(field, value, allowed)
@@ -118,13 +120,7 @@ def number(
         raise refusal(field, value, f"{allowed}, at most {LARGEST:g} in magnitude")
     if above == 0.0 and 0.0 < result < SMALLEST:
         raise refusal(field, value, f"{allowed}, at least {SMALLEST:g}")
-    outside = (
-        not np.isfinite(result)
-        or (above is not None and result <= above)
-        or (at_least is not None and result < at_least)
-        or (at_most is not None and result > at_most)
-    )
-    if outside:
+    if not (np.isfinite(result) and all(within(result, limit) for _, within, limit in given)):
         raise refusal(field, value, allowed)
     return result
 

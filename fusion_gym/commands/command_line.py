@@ -67,16 +67,12 @@ def check_options(values: Any) -> None:
     """Check every field of a command by its type, and that no output replaces an input."""
     declaration.check(values)
     for name in declaration.marked(type(values), OutputFile):
-        _refuse_input(values, name, getattr(values, name))
-
-
-def _refuse_input(values: Any, option: str, path: Path | None) -> None:
-    """Refuse to replace a file that another option names."""
-    for name in {item.name for item in fields(values)} - {option}:
-        other = getattr(values, name)
-        named = isinstance(other, str | Path) and os.path.exists(other)
-        if named and path is not None and os.path.exists(path) and path.samefile(other):
-            raise refusal(option, str(path), f"another file than {name}")
+        path = getattr(values, name)
+        for option in {item.name for item in fields(values)} - {name}:
+            other = getattr(values, option)
+            named = isinstance(other, str | Path) and os.path.exists(other)
+            if named and path is not None and os.path.exists(path) and path.samefile(other):
+                raise refusal(name, str(path), f"another file than {option}")
 
 
 def writable_folder(option: str, path: str | Path) -> None:

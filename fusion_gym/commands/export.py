@@ -7,6 +7,7 @@ observation. The command compares it with the agent on 10,000 observations of wh
 removes it if they differ.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -38,43 +39,48 @@ class Export(EnvironmentOptions, Command):
     """Run code of files: objects named as module:name, and code in the file of model:PATH."""
 
     def run(self) -> None:
-        """Write the file, check it and print its description."""
-        for line in export(self):
-            print(line)
+        """Write the file, check it and print its description; a wrong graph leaves no file."""
+        kind, _, rest = spec(self.model).partition(":")
+        env_id, options = self._trained(kind, rest.partition(",")[0])
+        require("onnx", "onnx", "onnx", "onnxruntime")
+        # Imported here, because torch takes seconds to load.
+        from fusion_gym.evaluation.onnx_export import export_onnx
+
+        task = make_task(env_id, **options)
+        agent = make_policy(f"{kind}:{rest}", task)
+        try:
+            with replacing(self.onnx) as unfinished:
+                model = export_onnx(agent, task, unfinished, env_id, self.model)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"model = {self.model!r} is not exported: {error}") from None
+        result = model.agreement
+        print(
+            f"{self.model} is in {self.onnx}: {model.size:,} bytes\n"
+            f"from {_ports(model.inputs)}\nto {_ports(model.outputs)}\n"
+            f"against the agent on {result.observations:,} observations of {result.episodes:,} "
+            f"episodes of {env_id}: all decisions agree, numbers differ by at most "
+            f"{result.difference:.2g}\n"
+            f"one decision on one thread here: {1e6 * model.latency.median:.1f} µs in the median, "
+            f"99 % below {1e6 * model.latency.most:.1f} µs"
+        )
 
     def interrupted(self) -> str:
         """Return the message after an interrupt, which leaves no file."""
         return f"interrupted: no new file in {self.onnx}"
 
-
-def export(command: Export) -> list[str]:
-    """Write the file and return its description in lines; a wrong graph leaves no file."""
-    kind, _, rest = spec(command.model).partition(":")
-    env_id, options = _environment(command, kind, rest.partition(",")[0])
-    require("onnx", "onnx", "onnx", "onnxruntime")
-    # Imported here, because torch takes seconds to load.
-    from fusion_gym.evaluation.onnx_export import export_onnx
-
-    task = make_task(env_id, **options)
-    agent = make_policy(f"{kind}:{rest}", task)
-    try:
-        with replacing(command.onnx) as unfinished:
-            model = export_onnx(agent, task, unfinished, env_id, command.model)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"model = {command.model!r} is not exported: {error}") from None
-    text = ", ".join(f"{name} {_shape(shape)}" for name, shape in model.inputs.items())
-    answers = ", ".join(f"{name} {_shape(shape)}" for name, shape in model.outputs.items())
-    result = model.agreement
-    return [
-        f"{command.model} is in {command.onnx}: {model.size:,} bytes",
-        f"from {text}",
-        f"to {answers}",
-        f"against the agent on {result.observations:,} observations of {result.episodes:,} "
-        f"episodes of {env_id}: all decisions agree, numbers differ by at most "
-        f"{result.difference:.2g}",
-        f"one decision on one thread here: {1e6 * model.latency.median:.1f} µs in the median, 99 % "
-        f"below {1e6 * model.latency.most:.1f} µs",
-    ]
+    def _trained(self, kind: str, name: str) -> tuple[str, Options]:
+        """Return id and options of the command line, or of the agent's training by default."""
+        if self.env is not None or self.config is not None:
+            return self.environment()
+        if kind == "zoo":
+            trained = zoo.card(name)["training"]["environment"]
+            own = parse_settings("option", [word for words in self.options for word in words])
+            return trained["id"], trained["options"] | own
+        file = Path(name).parent / "config.yaml"
+        if not file.is_file():
+            where = f"with model = {self.model!r}, whose folder has no config.yaml"
+            raise forbidden("env", None, "give --env ID or --config FILE", where)
+        return replace(self, config=str(file)).environment()
 
 
 def spec(text: str) -> str:
@@ -87,20 +93,5 @@ def spec(text: str) -> str:
     raise refusal("model", text, "zoo:NAME, model:PATH or the path of a .zip")
 
 
-def _environment(command: Export, kind: str, name: str) -> tuple[str, Options]:
-    """Return id and options of the command line, or of the agent's training by default."""
-    if command.env is None and command.config is None:
-        if kind == "zoo":
-            trained = zoo.card(name)["training"]["environment"]
-            own = parse_settings("option", [word for words in command.options for word in words])
-            return trained["id"], trained["options"] | own
-        config_file = Path(name).parent / "config.yaml"
-        if not config_file.is_file():
-            where = f"with model = {command.model!r}, whose folder has no config.yaml"
-            raise forbidden("env", None, "give --env ID or --config FILE", where)
-        command = replace(command, config=str(config_file))
-    return command.environment()
-
-
-def _shape(shape: tuple[str | int, ...]) -> str:
-    return f"({', '.join(map(str, shape))})"
+def _ports(shapes: Mapping[str, tuple[str | int, ...]]) -> str:
+    return ", ".join(f"{name} ({', '.join(map(str, shape))})" for name, shape in shapes.items())

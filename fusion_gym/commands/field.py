@@ -39,8 +39,7 @@ from fusion_gym.recordings import Recording, field_report, field_study, fit, fit
 from fusion_gym.recordings.field_report import DeviceName, FieldReport
 from fusion_gym.recordings.field_study import METHODS, PRACTICE, FieldStudy, MethodPoint, scale
 from fusion_gym.recordings.recording import SHIPPED
-from fusion_gym.training import config
-from fusion_gym.training.config import settings
+from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import ConfigurationError, number, refusal
 
@@ -216,15 +215,13 @@ def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodP
     fixed = {"tokens": "unlimited", "token_cost": 1.0, "horizon": study.horizon,
              "filter": "joint", "reward_scale": 1.0}  # fmt: skip
     options = {**study.options, **fixed, **drawn, "source": study.source}
-    experiment = config.Experiment(
-        environment=config.EnvironmentConfig(
-            id=field_study.ENV, options=json.loads(json.dumps(options))
-        ),
-        algorithm=settings({"name": "counterfactual_ppo", "n_steps": 8, "gamma": 0.99}),
-        training=config.TrainingConfig(timesteps=timesteps, num_envs=256, price_exponent=0.8),
-        validation=config.ValidationConfig(every=max(timesteps // 3, 1), episodes=64),
-        output=str(folder),
-    )
+    experiment = Experiment.model_validate({
+        "environment": {"id": field_study.ENV, "options": json.loads(json.dumps(options))},
+        "algorithm": {"name": "counterfactual_ppo", "n_steps": 8, "gamma": 0.99},
+        "training": {"timesteps": timesteps, "num_envs": 256, "price_exponent": 0.8},
+        "validation": {"every": max(timesteps // 3, 1), "episodes": 64},
+        "output": str(folder),
+    })  # fmt: skip
     if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
         raise KeyboardInterrupt
     rule, priced = f"model:{folder / 'best_model.zip'}", {**drawn, "reward_scale": 1.0}

@@ -91,9 +91,20 @@ class Film:
         times = np.arange(age - len(steps) + 1, age + 1)
         first = max(age - self._window, 0)
         self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
-        self._draw_states(times, steps, run, self.limits(run) if limits is None else limits)
-        if truth is not None:
-            for place, lines in enumerate(self._curves):
+        state, mean, deviation = self._series(steps, run)
+        ranges = self.limits(run) if limits is None else limits
+        for place, (axis, lines, ends) in enumerate(
+            zip(self._axes, self._curves, ranges, strict=False)
+        ):
+            centre, wide = mean[:, place], deviation[:, place]
+            lines[0].set_data(times, state[:, place])
+            lines[1].set_data(times, centre)
+            lines[2].remove()
+            lines[2] = axis.fill_between(
+                times, centre - wide, centre + wide, color=_ESTIMATE, alpha=0.18, lw=0
+            )
+            axis.set_ylim(*ends)
+            if truth is not None:
                 lines[3].set_data(np.arange(len(truth)) + 1, truth[:, place])
         pairs = [(s.outcome.requested[:, run], s.outcome.granted[:, run]) for s in steps]
         answers = np.array(pairs, dtype=np.bool_).reshape(-1, 2, self.task.sensors)
@@ -127,24 +138,6 @@ class Film:
         truth, mean, variance = (part.reshape(-1, visible) for part in (truth, mean, variance))
         return truth, mean, 2.0 * np.sqrt(np.maximum(variance, 0.0))
 
-    def _draw_states(
-        self,
-        times: NDArray[np.int64],
-        steps: list[_Step],
-        run: int,
-        limits: Sequence[tuple[float, float]],
-    ) -> None:
-        truth, mean, deviation = self._series(steps, run)
-        for place, (lines, ends) in enumerate(zip(self._curves, limits, strict=True)):
-            axis, centre, wide = self._axes[place], mean[:, place], deviation[:, place]
-            lines[0].set_data(times, truth[:, place])
-            lines[1].set_data(times, centre)
-            lines[2].remove()
-            lines[2] = axis.fill_between(
-                times, centre - wide, centre + wide, color=_ESTIMATE, alpha=0.18, lw=0
-            )
-            axis.set_ylim(*ends)
-
     def _draw_frame(self) -> None:
         """Draw the static parts of the picture."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -171,12 +164,11 @@ class Film:
             band = axis.fill_between(
                 [], [], [], color=_ESTIMATE, alpha=0.18, lw=0, label="± 2 claimed deviations"
             )
-            low, high = limits.get(place, (-np.inf, np.inf))
-            if np.isfinite(low):
-                axis.axhspan(-1e9, low, color=_CENSORED, alpha=0.15, lw=0, label="censored")
-            if np.isfinite(high):
-                label = None if np.isfinite(low) else "censored"
-                axis.axhspan(high, 1e9, color=_CENSORED, alpha=0.15, lw=0, label=label)
+            for end, beyond in zip(limits.get(place, ()), (-1e9, 1e9), strict=False):
+                if np.isfinite(end):
+                    axis.axhspan(
+                        *sorted((end, beyond)), color=_CENSORED, alpha=0.15, lw=0, label="censored"
+                    )
             axis.set_ylabel(name)
             (whole,) = axis.plot([], [], color=_TRUTH, lw=1.0, alpha=0.3)
             self._curves.append([truth, mean, band, whole])

@@ -126,13 +126,9 @@ def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
     star = "" if covers("centre", block.knowledge) else " *"
     low, high = block.bounds
     meaning = plain_marks(block.meaning) + (f"; {condition}" if condition else "")
-    return name + star, f"{low:g}..{high:g}", _visibility(task, block), meaning
-
-
-def _visibility(task: Task, block: Block) -> str:
-    """Return the part of a block that a local sensor observes."""
     received = all(is_received(entry, task.broadcast) for entry in block_entries(block))
-    return "all" if received else _SEES[block.node]
+    seen = "all" if received else _SEES[block.node]  # by a local sensor
+    return name + star, f"{low:g}..{high:g}", seen, meaning
 
 
 def _axis(task: Task, block: Block, place: int) -> str:

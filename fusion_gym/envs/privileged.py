@@ -20,7 +20,6 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.envs.vector import Infos
 from fusion_gym.validation import refusal
 
 _MOST_BITS = 62  # of an integer that encodes grants and run
@@ -70,13 +69,11 @@ def alternatives(
         granted, base, other = granted * each, before.task.network.slots + 1, np.arange(values.size)
     error, communication = taken.error, taken.reward_communication
     if other.size:
-        first = np.arange(other.size)
+        first = place = np.arange(other.size)
         if sensors * (base - 1).bit_length() + runs.bit_length() <= _MOST_BITS:
             codes = base ** np.arange(sensors) @ granted[:, other] * runs + other % runs
             _, first, place = np.unique(codes, return_index=True, return_inverse=True)
-            values[other] = runs + place
-        else:
-            values[other] = runs + first
+        values[other] = runs + place
         places = other[first]
         run, sent = places % runs, granted[:, places]
         if before.memory.keeps_every:
@@ -93,10 +90,6 @@ def alternatives(
         communication[values].reshape(many, runs),
         observation[values].reshape(many, runs, -1),
     )
-
-
-# Groups of runs whose first episodes have different lengths.
-_GROUPS = 8
 
 
 class Branched(NamedTuple):
@@ -128,6 +121,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
     Raises:
         ConfigurationError: ``error`` is unknown, or lacks a reference or the task's squared error.
     """
+
+    _groups = 8
 
     def __init__(
         self,
@@ -169,15 +164,9 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         assert branched is not None
         return result, branched
 
-    def _begin(self) -> None:
+    def _begin(self, runs: NDArray[np.int64] | None = None) -> None:
         self._observed = None
-        self.batch.reset(stagger=self.stagger, groups=_GROUPS)
-
-    def _finish(
-        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[Infos]
-    ) -> None:
-        super()._finish(runs, lengths, infos)
-        self._observed = None
+        super()._begin(runs)
 
     def _observe(self) -> NDArray[np.float32]:
         return super()._observe() if self._observed is None else self._observed

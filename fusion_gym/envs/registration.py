@@ -1,10 +1,10 @@
 """The registered environments: an id names a ``build`` function from options to a scenario."""
 
 import copy
-import importlib
 import inspect
 import json
 import os
+import pkgutil
 import re
 import typing
 from collections.abc import Callable, Mapping
@@ -176,11 +176,8 @@ def base_of(env_id: str) -> tuple[str, Options]:
 def build_of(env_id: str) -> Build:
     """Return the ``build`` function behind an id."""
     entry = ENVIRONMENTS[base_of(env_id)[0]]
-    if not isinstance(entry, str):
-        return entry
-    module, _, name = entry.partition(":")
-    member: Build = getattr(importlib.import_module(module), name)
-    return member
+    build: Build = pkgutil.resolve_name(entry) if isinstance(entry, str) else entry
+    return build
 
 
 def options_of(env_id: str) -> type[CommonOptions]:
@@ -249,13 +246,8 @@ def open_options(env_id: str, options: Mapping[str, Any]) -> Options:
     base, registered = base_of(env_id)
     if "system" not in options or "system" in {field.name for field in fields(options_of(base))}:
         return dict(options)
-    beside = {name: value for name, value in options.items() if name != "system"}
-    content = _read_options(options["system"])
-    return {name: content[name] for name in content if name not in registered} | beside
-
-
-def _read_options(path: str | os.PathLike[str]) -> Options:
-    """Return the options of a YAML file by name."""
+    beside = dict(options)
+    path = beside.pop("system")
     if not isinstance(path, (str, os.PathLike)):
         raise refusal("system", path, "the path of a YAML file")
     from fusion_gym.yaml_text import load_yaml
@@ -265,7 +257,7 @@ def _read_options(path: str | os.PathLike[str]) -> Options:
         raise ConfigurationError(
             f"system = {os.fspath(path)!r} is not allowed: it must hold a mapping of options"
         )
-    return content
+    return {name: content[name] for name in content if name not in registered} | beside
 
 
 def _plain_text(args: Options) -> str | None:

@@ -55,6 +55,8 @@ class FusionSB3VecEnv(VecEnv):
         (12, 17)
     """
 
+    _groups: int | None = None  # of runs whose first episodes have different lengths
+
     def __init__(
         self,
         task: Task,
@@ -174,11 +176,11 @@ class FusionSB3VecEnv(VecEnv):
                 self.reset_infos[row] = {}
         self._returns[runs] = 0.0
         self._spent[runs] = 0.0
-        self.batch.reset(runs)
+        self._begin(runs)
 
-    def _begin(self) -> None:
-        """Begin new episodes in all runs."""
-        self.batch.reset(stagger=self.stagger)
+    def _begin(self, runs: NDArray[np.int64] | None = None) -> None:
+        """Begin new episodes in ``runs``, or the first ones in all, whose lengths may spread."""
+        self.batch.reset(runs, stagger=self.stagger and runs is None, groups=self._groups)
 
     def _advance(self, requests: NDArray[Any]) -> Outcome:
         """Step the batch, before finished runs are reset."""

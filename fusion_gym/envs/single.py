@@ -2,6 +2,7 @@
 
 import functools
 import sys
+import traceback
 import warnings
 from typing import Any
 
@@ -146,12 +147,9 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
 
 def _steps_singly() -> bool:
     """Return whether a ``DummyVecEnv`` of Stable-Baselines3 calls the reset."""
-    frame = sys._getframe(2)
-    while frame.f_back is not None:
-        frame = frame.f_back
-        if frame.f_globals.get("__name__") == "stable_baselines3.common.vec_env.dummy_vec_env":
-            return True
-    return False
+    module = "stable_baselines3.common.vec_env.dummy_vec_env"
+    _, *callers = traceback.walk_stack(sys._getframe(2))
+    return any(frame.f_globals.get("__name__") == module for frame, _ in callers)
 
 
 @functools.cache

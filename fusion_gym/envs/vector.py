@@ -132,9 +132,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
             seeds = [int(seed) + run for run in range(self.num_envs)]
         else:
             if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str):
-                raise ValueError(
-                    f"seed = {seed!r} is not allowed: it must be a whole number or a sequence"
-                )
+                raise validation.refusal("seed", seed, "a whole number or a sequence")
             kinds = (int, np.integer, type(None))
             if any(isinstance(entry, bool) or not isinstance(entry, kinds) for entry in seed):
                 raise validation.refusal("seed", seed, "a whole number, or whole numbers and None")
@@ -144,10 +142,8 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         mask = self._reset_mask(options)
         runs = np.flatnonzero(mask)
         self.batch.seed(runs, [seeds[run] for run in runs])
-        self.batch.reset(None if mask.all() else runs)
+        self._begin(runs)
         self._started |= mask
-        if self._film is not None:
-            self._film.begin(runs)
         infos = step_infos(reset_outcome(self.task, self.num_envs))
         return self.batch.observe(), _with_mask(infos, mask)
 
@@ -157,11 +153,11 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
             return None
         return tuple(self._film.frame(run) for run in range(self.num_envs))
 
-    def _renew(self, runs: NDArray[np.bool_]) -> None:
-        """Begin new episodes in ``runs``, a mask (N,)."""
-        self.batch.reset(np.flatnonzero(runs))
+    def _begin(self, runs: NDArray[np.int64]) -> None:
+        """Begin new episodes in ``runs``."""
+        self.batch.reset(runs)
         if self._film is not None:
-            self._film.begin(np.flatnonzero(runs))
+            self._film.begin(runs)
 
     def _reset_mask(self, options: Arguments | None) -> NDArray[np.bool_]:
         validation.reset_options(options, ["reset_mask"])
@@ -209,14 +205,14 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         reward, ended = rewards_of(self.task, outcome), outcome.ended
         infos = step_infos(outcome)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and finished.any():
-            self._renew(finished)
+            self._begin(np.flatnonzero(finished))
             reward = np.where(finished.reshape(-1, *[1] * (reward.ndim - 1)), 0.0, reward)
             ended = ended & ~finished
             infos = _cleared(infos, finished)
         final: Infos = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
             final = _final_infos(infos, ended, batch.observe())
-            self._renew(ended)
+            self._begin(np.flatnonzero(ended))
             infos = _cleared(infos, ended)
         never = np.zeros_like(ended)
         terminated, truncated = (ended, never) if self.task.options.clock else (never, ended)
@@ -245,17 +241,14 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         )
 
     def _attribute(self, name: str) -> Any:
-        if name == "observation_space":
-            return self.single_observation_space
-        if name == "action_space":
-            return self.single_action_space
-        if name in _SHARED and hasattr(self, name):
-            return getattr(self, name)
-        known = [*_METHODS, "observation_space", "action_space"]
-        known += [shared for shared in _SHARED if hasattr(self, shared)]
+        spaces = self.single_observation_space, self.single_action_space
+        known = dict(zip(("observation_space", "action_space"), spaces, strict=True))
+        known |= {shared: getattr(self, shared) for shared in _SHARED if hasattr(self, shared)}
+        if name in known:
+            return known[name]
         raise AttributeError(
             f"the runs share one batch and have no {validation.display(name)}: known are "
-            + ", ".join(known)
+            + ", ".join([*_METHODS, *known])
         )
 
 

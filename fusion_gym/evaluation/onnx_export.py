@@ -96,10 +96,13 @@ class DecisionGraph(torch.nn.Module):
         self.high: torch.Tensor
         self.register_buffer("low", torch.as_tensor(agent.view.space.low[stored]))
         self.register_buffer("high", torch.as_tensor(agent.view.space.high[stored]))
-        self.choices = _choices(agent)
+        self.choices: np.ndarray[Any, Any] | None = None  # requests (choices, k) of each action
+        if isinstance(action.space, spaces.Discrete):
+            table = np.eye(2, 1, -1) if agent.view.local else action.table
+            self.choices = table.astype(np.int8)
         self._table: torch.Tensor | None
-        table = None if self.choices is None else torch.as_tensor(self.choices, dtype=torch.float32)
-        self.register_buffer("_table", table)
+        known = None if self.choices is None else torch.as_tensor(self.choices, dtype=torch.float32)
+        self.register_buffer("_table", known)
         sensors = agent.task.sensors if agent.view.rows_per_run == 1 else 1
         self.inputs, self.outputs = self._named(sensors, policy)
 
@@ -129,7 +132,12 @@ class DecisionGraph(torch.nn.Module):
         if self._values:
             values = self._policy.q_net(rows)
             return self._taken(values), values
-        logits, memory = self._logits(rows, more)
+        policy, memory = self._policy, ()
+        features = BasePolicy.extract_features(policy, rows, policy.pi_features_extractor)
+        if self._recurrent:
+            latent, memory = policy.lstm_actor(features.unsqueeze(0), (more[0], more[1]))
+            features = latent.squeeze(0)
+        logits = policy.action_net(policy.mlp_extractor.forward_actor(features))
         probability = self._probability(logits, more[0] if self._masked else None)
         if self._table is None:
             marginal = probability
@@ -138,18 +146,6 @@ class DecisionGraph(torch.nn.Module):
             marginal = probability @ self._table
             request = self._taken(probability)
         return request, marginal, logits, *memory
-
-    def _logits(
-        self, rows: torch.Tensor, more: tuple[torch.Tensor, ...]
-    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-        policy: Any = self._policy
-        memory: tuple[torch.Tensor, ...] = ()
-        extractor = policy.pi_features_extractor
-        features: torch.Tensor = BasePolicy.extract_features(policy, rows, extractor)
-        if self._recurrent:
-            latent, memory = policy.lstm_actor(features.unsqueeze(0), (more[0], more[1]))
-            features = latent.squeeze(0)
-        return policy.action_net(policy.mlp_extractor.forward_actor(features)), memory
 
     def _probability(self, logits: torch.Tensor, open_: torch.Tensor | None) -> torch.Tensor:
         """Return the probability of each request (B, k), or with a table of each choice."""
@@ -179,14 +175,6 @@ class DecisionGraph(torch.nn.Module):
             kind = torch.bool if name == "grantable" else torch.float32
             result.append((torch.ones if name == "grantable" else torch.zeros)(sizes, dtype=kind))
         return tuple(result)
-
-
-def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
-    """Return the requests (choices, k) int8 of each discrete action; None for bits."""
-    action = agent.view.action
-    if not isinstance(action.space, spaces.Discrete):
-        return None
-    return (np.eye(2, 1, -1) if agent.view.local else action.table).astype(np.int8)
 
 
 def save_graph(graph: DecisionGraph, path: Path, received: Mapping[str, str]) -> None:
@@ -241,6 +229,8 @@ def onnx_card(
         number = Block("sensor", "number of the sensor", np.array, (numbered(task.sensors),))
         blocks.append(_block(number, local))
     price = task.reward.price.span
+    low, high = price or (1.0, 1.0)
+    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     values = {
         "inputs": _ports(graph.inputs),
         "outputs": _ports(graph.outputs),
@@ -256,7 +246,7 @@ def onnx_card(
         },
         "options": task.settings,
         "price_range": price if agent.price is None else None,
-        "fixed_price": _fixed_price(agent),
+        "fixed_price": None if agent.price is None else low * (high / low) ** agent.price,
     }
     words = {
         "format": FORMAT,
@@ -266,15 +256,9 @@ def onnx_card(
         "environment": environment,
         "decides": "each sensor locally" if local else "a scheduler of all sensors",
         "knows": MEANING[agent.knowledge],
-        "observation_version": layout_version(environment, names),
+        "observation_version": f"{environment}:{digest[:16]}",  # hash of names and order
     }
     return words | {key: json.dumps(_finite(plain_options(value))) for key, value in values.items()}
-
-
-def layout_version(environment: str, names: list[str]) -> str:
-    """Return the id of the environment and a hash of the entries' names and order."""
-    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
-    return f"{environment}:{digest[:16]}"
 
 
 def _ports(shapes: Shapes) -> Plain:
@@ -292,15 +276,6 @@ def _block(block: Block, local: bool) -> Plain:
         "bounds": list(block.bounds),
         "constants": {key: np.asarray(value).tolist() for key, value in block.constants.items()},
     }
-
-
-def _fixed_price(agent: ModelPolicy) -> float | None:
-    """Return the fixed price of a token of the agent, if it has one."""
-    span = agent.task.reward.price.span
-    if agent.price is None or span is None:
-        return None
-    low, high = span
-    return float(low * (high / low) ** agent.price)
 
 
 def _finite(value: Any) -> Any:

@@ -25,11 +25,9 @@ def table_tables(
 ) -> Table:
     """Return a table whose first column is folded text and whose others are numbers."""
     result = Table(title=title, box=box.SIMPLE_HEAD, caption=caption)
-    for place, column in enumerate(columns):
-        if place:
-            result.add_column(column, justify="right", no_wrap=True)
-        else:
-            result.add_column(column, overflow="fold")
+    result.add_column(columns[0], overflow="fold")
+    for column in columns[1:]:
+        result.add_column(column, justify="right", no_wrap=True)
     for row in rows:
         result.add_row(*row)
     return result

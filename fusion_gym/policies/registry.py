@@ -8,8 +8,8 @@ names a saved agent, with settings after a comma. ``package.module:Class`` or
 import ast
 import contextlib
 import dataclasses
-import importlib
 import inspect
+import pkgutil
 import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple, TypedDict, get_args
@@ -318,10 +318,7 @@ def _parse_policy(spec: str) -> tuple[str, PolicyRow, str]:
 
 
 def _maker(row: PolicyRow) -> Maker:
-    if not isinstance(row.maker, str):
-        return row.maker
-    module, _, attribute = row.maker.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return pkgutil.resolve_name(row.maker) if isinstance(row.maker, str) else row.maker
 
 
 def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:

@@ -37,7 +37,6 @@ from fusion_gym.policies.base import (
     strongest,
     surprise,
 )
-from fusion_gym.validation import boolean, refusal
 
 RATE = SearchRange(1e-3, 1.0)
 AGE = SearchRange(1.0, 1e3, per_sensor=False)
@@ -890,7 +889,7 @@ class BeliefRule(Rule):
     """
 
     task: Task = field(repr=False)
-    own: bool = parameter(False, boolean)
+    own: bool = parameter(False, validation.boolean)
     together: ClassVar[tuple[str, ...]] = ("at_most",)
 
     def __post_init__(self) -> None:
@@ -920,13 +919,15 @@ def check_owner(task: Task, own: bool, **only_together: Any) -> None:
     """Check that a task shows the measurements, and with ``own`` allows local decisions."""
     if task.options.information != "sensors":
         allowed = "'sensors', because it reads new measurements"
-        raise refusal("information", task.options.information, allowed, "with this rule")
+        raise validation.refusal("information", task.options.information, allowed, "with this rule")
     if not own:
         return
     SensorView(task)  # refuses tasks without local decisions
     for name, value in only_together.items():
         if value not in (None, 0, 1):
-            raise refusal(name, value, "left out with own=True, because sensors decide locally")
+            raise validation.refusal(
+                name, value, "left out with own=True, because sensors decide locally"
+            )
 
 
 def beliefs_of(signals: Signals, own: bool) -> Beliefs:

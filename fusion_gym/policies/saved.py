@@ -58,16 +58,7 @@ from fusion_gym.errors import forbidden
 from fusion_gym.policies.base import Policy, Requests, Stateless
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules import PricedThreshold, beliefs_of
-from fusion_gym.validation import (
-    ConfigurationError,
-    boolean,
-    display,
-    entries,
-    integer,
-    keys,
-    number,
-    refusal,
-)
+from fusion_gym.validation import ConfigurationError, display, refusal
 
 LARGEST = 256 * 2**20  # bytes of a part, and of all weights
 MOST = 1_000  # tensors
@@ -211,7 +202,7 @@ class ModelView:
             raise ConfigurationError("observation_names is not allowed: it must be a list of words")
         return cls(
             None if names is None else tuple(names),
-            boolean("local", card_entry.get("local", False)),
+            validation.boolean("local", card_entry.get("local", False)),
             None if span is None else Price.create("random", span).span,
             None if error is None else _errors(error),
         )
@@ -233,33 +224,22 @@ class ModelView:
         return replace(task, nominal_error=np.array(error))
 
 
-@dataclass(frozen=True)
-class Blueprint:
-    """The description from which a policy is built, with its weights and the task's spaces."""
-
-    algorithm: str
-    arguments: Arguments  # of the policy's class
-    shape: tuple[int]  # of an observation
-    actions: str  # the action space, as Gymnasium writes it
-
-    @classmethod
-    def read(cls, data: Mapping[str, Any]) -> Blueprint:
-        """Return the blueprint of the readable entries of Stable-Baselines3."""
-        card_entry = _entry(data)
-        if "format" in card_entry:
-            integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
-            known = {"format", "algorithm", "reward_scale"} | ModelView.__dataclass_fields__.keys()
-            keys("entry of the card", card_entry, known | _REPEATED)
-        algorithm = algorithm_of(data)
-        module = _table(data, "policy_class").get("__module__")
-        if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
-            raise NeedsTrust(f"its policy belongs to none of {', '.join(POLICIES)}")
-        match _table(data, "observation_space"):
-            case {":type:": "<class 'gymnasium.spaces.box.Box'>", "_shape": [int(size)]}:
-                return cls(
-                    algorithm, _arguments(_table(data, "policy_kwargs")), (size,), _actions(data)
-                )
-        raise NeedsTrust("its observation is not a vector")
+def read_declaration(data: Mapping[str, Any]) -> tuple[str, Arguments, tuple[int], str]:
+    """Return algorithm, arguments of the policy's class, shape of an observation, and actions."""
+    card_entry = _entry(data)
+    if "format" in card_entry:
+        validation.integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
+        known = {"format", "algorithm", "reward_scale"} | ModelView.__dataclass_fields__.keys()
+        validation.keys("entry of the card", card_entry, known | _REPEATED)
+    algorithm = algorithm_of(data)
+    module = _table(data, "policy_class").get("__module__")
+    if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
+        raise NeedsTrust(f"its policy belongs to none of {', '.join(POLICIES)}")
+    match _table(data, "observation_space"):
+        case {":type:": "<class 'gymnasium.spaces.box.Box'>", "_shape": [int(size)]}:
+            arguments = _arguments(_table(data, "policy_kwargs"))
+            return algorithm, arguments, (size,), _actions(data)
+    raise NeedsTrust("its observation is not a vector")
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
@@ -488,7 +468,7 @@ def load_model_policy(
         ConfigurationError: no such file, no Stable-Baselines3 model, a model that its weights
             cannot rebuild (without ``trust``), or another observation layout or action space.
     """
-    boolean("deterministic", deterministic)
+    validation.boolean("deterministic", deterministic)
     file = model_file(path)
     try:
         data = read_plain(file)
@@ -542,11 +522,12 @@ def _rebuilt(
     file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
 ) -> tuple[BaseAlgorithm, str]:
     """Return the model from its readable entries and its weights, and its kind of action."""
-    blueprint, weights = Blueprint.read(data), read_weights(file)
-    action, view = _fitted(task, observed, blueprint.shape, blueprint.actions)
+    algorithm, arguments, shape, actions = read_declaration(data)
+    weights = read_weights(file)
+    action, view = _fitted(task, observed, shape, actions)
     # Without environment, buffers and optimiser, so it cannot learn.
-    kind: Any = ALGORITHMS[blueprint.algorithm]
-    base = POLICIES[blueprint.algorithm]
+    kind: Any = ALGORITHMS[algorithm]
+    base = POLICIES[algorithm]
     model = kind(base, env=None, device="cpu", _init_setup_model=False)
     model.observation_space, model.action_space = view.space, view.action.space
     # On the meta device the declared networks take no memory before the weights fit them.
@@ -558,15 +539,15 @@ def _rebuilt(
                 view.action.space,
                 lr_schedule=lambda _: 0.0,
                 optimizer_class=lambda *_, **__: None,
-                **blueprint.arguments,
+                **arguments,
             )
         model.policy.load_state_dict(weights, strict=True, assign=True)
     except Exception:  # a crafted file may declare anything
-        raise NeedsTrust(f"its weights do not fit {blueprint.algorithm}") from None
+        raise NeedsTrust(f"its weights do not fit {algorithm}") from None
     model.policy.__class__ = base
-    if blueprint.algorithm == "dqn":  # its random decisions need the exploration rate
+    if algorithm == "dqn":  # its random decisions need the exploration rate
         rate = data.get("exploration_rate", 0.0)
-        rate = number("exploration_rate", rate, at_least=0.0, at_most=1.0)
+        rate = validation.number("exploration_rate", rate, at_least=0.0, at_most=1.0)
         model.exploration_rate = rate
     return model, action
 
@@ -767,22 +748,25 @@ def read_calibration(file: Path) -> tuple[str, list[float], list[CalibrationPoin
         ConfigurationError: the file has no calibration, or a value is not allowed.
     """
     content = read_plain(file, CALIBRATION)
-    keys(f"entry of {CALIBRATION}", content, ("rule", "slopes", "points"))
+    validation.keys(f"entry of {CALIBRATION}", content, ("rule", "slopes", "points"))
     rule, slopes, rows = (content.get(name) for name in ("rule", "slopes", "points"))
     if not isinstance(rule, str):
         raise refusal("rule", rule, "a text")
-    slopes = [number("slopes", b, above=0.0) for b in entries("slopes", slopes, "a slope", "agent")]
+    slopes = [
+        validation.number("slopes", b, above=0.0)
+        for b in validation.entries("slopes", slopes, "a slope", "agent")
+    ]
     points: list[CalibrationPoint] = []
-    for row in entries("points", rows, "a calibration", "price"):
+    for row in validation.entries("points", rows, "a calibration", "price"):
         if not isinstance(row, dict) or row.keys() != {*CalibrationPoint._fields}:
             raise refusal("points", row, f"an object with {', '.join(CalibrationPoint._fields)}")
         least = points[-1].price if points else 0.0
         points.append(
             CalibrationPoint(
-                number("price", row["price"], above=least),
-                integer("agent", row["agent"], at_least=0, at_most=len(slopes) - 1),
-                number("mixture", row["mixture"], at_least=0.0, at_most=1.0),
-                number("threshold", row["threshold"]),
+                validation.number("price", row["price"], above=least),
+                validation.integer("agent", row["agent"], at_least=0, at_most=len(slopes) - 1),
+                validation.number("mixture", row["mixture"], at_least=0.0, at_most=1.0),
+                validation.number("threshold", row["threshold"]),
             )
         )
     return rule, slopes, points

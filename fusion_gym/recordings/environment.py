@@ -269,15 +269,6 @@ def _example(choice: RecordedFusionOptions) -> RecordedFusionOptions:
     return replace(choice, log="tanks", **options)
 
 
-def _filled(values: Array) -> Array:
-    """Return deviations (T, l) with straight lines in gaps, which no policy sees."""
-    result, places = values.copy(), np.arange(len(values))
-    for column in result.T:
-        known = np.isfinite(column)
-        column[~known] = np.interp(places[~known], places[known], column[known])
-    return result
-
-
 def _noises(plant: LinearPlant, path: Array, count: int) -> Array:
     """Return the process noise (T - 1, r) that leads along the states of a path (T, n)."""
     factor, transition = plant.process_factor[..., 0], plant.transition[..., 0]
@@ -293,8 +284,13 @@ def _noises(plant: LinearPlant, path: Array, count: int) -> Array:
 
 
 def _states(values: Array, order: int) -> Array:
-    """Return states (T, n) of deviations (T, l): the newest first, then its lags."""
-    path = _filled(values)
+    """Return states (T, n) of deviations (T, l): the newest first, then its lags.
+
+    Gaps have straight lines, which no policy sees.
+    """
+    import pandas as pd
+
+    path = np.ascontiguousarray(pd.DataFrame(values).interpolate(limit_direction="both"))
     lags = [np.vstack([path[:1]] * lag + [path[: len(path) - lag]]) for lag in range(order)]
     return np.hstack(lags)
 

@@ -376,14 +376,8 @@ class Experiment(Strict):
 
     def inputs(self) -> Plain:
         """Return the inputs that determine the results, without length, folder and threads."""
-        return self.model_dump(
-            mode="json",
-            exclude={
-                "output": True,
-                "calibration": True,
-                "training": {"timesteps": True, "threads": True},
-            },
-        )
+        left_out: Any = {"output": True, "calibration": True, "training": {"timesteps", "threads"}}
+        return self.model_dump(mode="json", exclude=left_out)
 
     def resolved(self, settings: Mapping[str, Any], sensors: int) -> Experiment:
         """Return the experiment with numbers in the place of ``"auto"`` and ``many_sensors``."""

@@ -153,22 +153,16 @@ class Counterfactual(OnPolicyAlgorithm):
 
     def _credited(self, steps: list[_Step]) -> RolloutBatch:
         """Return the batch of a rollout, before the division by the spread."""
-        values = [self._value(step.observation.numpy()) for step in steps]
-        advantages, surplus, returns = [], [], []
-        ahead = np.zeros(len(steps[0].dones))
-        for place, step in reversed(list(enumerate(steps))):
-            mean = (np.exp(step.old.numpy()) * step.values).sum(-1)
-            left = np.zeros_like(ahead)
-            if place + 1 < len(steps):
-                left = self.gamma * self.gae_lambda * (ahead - step.follows)
-                left[step.dones] = 0.0
-            ahead = mean.mean(-1) + left
-            advantages.append(step.values - mean[..., None])
-            surplus.append(left)
-            returns.append(ahead)
+        means = [(np.exp(step.old.numpy()) * step.values).sum(-1) for step in steps]
+        returns = np.array([mean.mean(-1) for mean in means])  # before δ
+        surplus = np.zeros_like(returns)
+        for place, step in reversed(list(enumerate(steps[:-1]))):
+            left = self.gamma * self.gae_lambda * (returns[place + 1] - step.follows)
+            surplus[place] = np.where(step.dones, 0.0, left)
+            returns[place] += surplus[place]
 
-        def joined(parts: list[Any]) -> torch.Tensor:
-            return torch.as_tensor(np.concatenate(parts[::-1]), dtype=torch.float32)
+        def joined(parts: Any) -> torch.Tensor:
+            return torch.as_tensor(np.concatenate(parts), dtype=torch.float32)
 
         masks = [step.masks for step in steps if step.masks is not None]
         return RolloutBatch(
@@ -176,10 +170,10 @@ class Counterfactual(OnPolicyAlgorithm):
             torch.cat(masks) if masks else None,
             torch.as_tensor(np.concatenate([step.choices for step in steps])),
             torch.cat([step.old for step in steps]),
-            joined(advantages),
+            joined([s.values - mean[..., None] for s, mean in zip(steps, means, strict=True)]),
             joined(surplus),
             joined(returns),
-            torch.as_tensor(np.concatenate(values), dtype=torch.float32),
+            joined([self._value(step.observation.numpy()) for step in steps]),
         )
 
     def train(self) -> None:
@@ -297,7 +291,8 @@ class Counterfactual(OnPolicyAlgorithm):
         if not self._decisions.local:
             return self._value(observation)
         # One by one, because the rows of all alternatives would not fit into the cache.
-        return np.stack([self._value(self._decisions.visible_rows(item)) for item in observation])
+        rows = map(self._decisions.view.rows, observation)
+        return np.stack([self._value(self._decisions.by_run(item)) for item in rows])
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
         """Return the masks of the runs' decisions, for an algorithm with masks."""
@@ -408,10 +403,6 @@ class Decisions:
     def by_run(self, rows: Any) -> Any:
         """Return local rows (rows, entries) by run (runs, sensors, entries); others unchanged."""
         return rows.reshape(-1, self.sensors, rows.shape[-1]) if self.local else rows
-
-    def visible_rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the local views (runs, sensors, entries) of observations (runs, entries)."""
-        return self.by_run(self.view.rows(observation))
 
     def actions(self, choice: Choices) -> NDArray[Any]:
         """Return the actions of the rows from the choices (runs, D)."""

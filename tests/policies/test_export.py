@@ -1,7 +1,9 @@
 """An exported file decides as the agent does, says what it sees, and is refused where it cannot."""
 
+import contextlib
 import functools
 import importlib.util
+import io
 import json
 import re
 import shutil
@@ -18,7 +20,7 @@ from small_models import ENV, MODELS
 
 import fusion_gym
 from fusion_gym import zoo
-from fusion_gym.commands.export import Export, export, spec
+from fusion_gym.commands.export import Export, spec
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
@@ -151,7 +153,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def command(model: str, path: Path, *options: str, **value: Any) -> list[str]:
-    return export(Export(model, path, options=(options,) if options else (), **value))
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        Export(model, path, options=(options,) if options else (), **value).run()
+    return output.getvalue().splitlines()
 
 
 AGENTS = ["remote_estimation_local", "biased_oscillator_scheduler"]
