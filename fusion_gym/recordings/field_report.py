@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
@@ -97,9 +96,14 @@ def card_row(card: ChannelCard) -> tuple[str, ...]:
 
 
 DeviceName = Literal["zigbee", "bacnet", "esphome"]
-# Shortest and longest interval in seconds.
-DEVICES = {
-    "zigbee": (1.0, 65_534.0), "bacnet": (1.0, 4_294_967_295.0), "esphome": (0.001, 4_294_967.0),
+# Shortest and longest interval in seconds, and the meaning of the fields with its source.
+DEVICES: dict[str, tuple[float, float, str]] = {
+    "zigbee": (1.0, 65_534.0, "whole seconds, and steps of the attribute MeasuredValue "
+               "(Zigbee Cluster Library, Configure Reporting)"),
+    "bacnet": (1.0, 4_294_967_295.0, "COV_Increment in the object's unit, and seconds after which "
+               "the centre subscribes again (ANSI/ASHRAE 135, SubscribeCOV)"),
+    "esphome": (0.001, 4_294_967.0, "filters of the sensor; a delta must be exceeded "
+                "(ESPHome, Sensor Filters)"),
 }  # fmt: skip
 _TEMPERATURE = "Temperature Measurement 0x0402", 0.01, 32_767
 _HUMIDITY = "Relative Humidity 0x0405", 0.01, 65_535
@@ -124,7 +128,7 @@ def longest_interval(device: DeviceName, seconds: float) -> int:
     Raises:
         ConfigurationError: the device cannot hold one step.
     """
-    low, high = DEVICES[device]
+    low, high, _ = DEVICES[device]
     if not low <= seconds <= high:
         allowed = f"a device with an interval of {seconds:g} s, not from {low:g} to {high:g} s"
         raise refusal("device", device, allowed)
@@ -158,6 +162,24 @@ def fields_of(
     steps = round(change / step) if step else f"{change:g} in unknown steps"
     intervals = {"minimum_reporting_interval": int(least), "maximum_reporting_interval": int(most)}
     return {"cluster": cluster, "reportable_change": steps, **intervals}
+
+
+_CHANGE = "Sensors report on change"
+MEANINGS = {
+    PRACTICE: f"{_CHANGE}, with one scale of all thresholds; the centre holds the last reading.",
+    "practice, one a sensor": f"{_CHANGE}, each with its own threshold; the centre holds the last "
+    "reading.",
+    "silence ignored, one a sensor": f"{_CHANGE}, each with its own threshold; the centre has a "
+    "Kalman filter.",
+    "silence used": f"{_CHANGE}, with one scale of all thresholds; the centre uses silence.",
+    "silence used, one a sensor": f"{_CHANGE}, each with its own threshold; the centre uses "
+    "silence.",
+    "centralised": "Value of information: a scheduler sees all readings.",
+    "agent": "Counterfactual PPO: a scheduler sees all readings.",
+}
+_STYLE = "body{font-family:sans-serif;max-width:60em;margin:2em auto;padding:0 1em}td,th{\
+padding:.2em .7em;border-bottom:1px solid #ccc;text-align:left}img{max-width:100%}\
+pre{background:#f4f4f4;padding:1em;overflow:auto}table{border-collapse:collapse}"
 
 
 @dataclass(frozen=True)
@@ -200,39 +222,87 @@ class FieldReport:
 
 def write_report(report: FieldReport, folder: Path) -> str:
     """Write report.md, report.html and devices.yaml, and return the results and settings."""
-    best = report.best
-    devices = yaml.safe_dump(_settings(report), sort_keys=False, allow_unicode=True)
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    templates = jinja2.Environment(
-        loader=loader, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )  # fmt: skip
-    functions = card_lines, criticism_rows, device_table, results_table, table, tolerance_table
-    values = {function.__name__: function for function in functions} | {
-        "report": report, "study": report.study, "version": __version__, "devices": devices,
-        "best": next((row for row in report.results if row.name == best), None),
-        "practice": PRACTICE, "filter": METHODS[best][0],
-        "seconds": report.recording.interval.total_seconds(), "ratios": RATIOS,
-        "columns": COLUMNS, "cards": [card_row(card) for card in report.whole.card],
-    }  # fmt: skip
-    rendered = templates.get_template("report.md").make_module(values)
-    markdown = str(rendered)
+    study, whole = report.study, report.whole
+    best, windows = report.best, len(report.points[PRACTICE][0].errors)
+    seconds, settings = report.recording.interval.total_seconds(), _settings(report)
+    devices = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
+    filter_name = METHODS[best][0]
+    thresholds = [row["reportable_change"] for row in settings.values()]
+    trigger = f' trigger="report_on_change", trigger_threshold={thresholds},'
+    trigger = trigger if filter_name == "truncated" else ""
+    target = "the tolerance" if study.tolerance else f"{study.rate:g} packets a sensor and step"
+    summary = [
+        f"## At {target}",
+        f"{windows} windows of {study.horizon} steps, which were not fitted.",
+        *(_tolerance_lines(report) if study.tolerance else _rate_lines(report)),
+        device_table(report),
+        *([] if report.device is None else [f"{report.device}: {DEVICES[report.device][2]}"]),
+        f"Intervals are in seconds; a step is {seconds:g} s. `devices.yaml`:",
+        f"```yaml\n{devices}```",
+        "A simulation of the centre:",
+        f"```python\nimport fusion_gym\n\ntask = fusion_gym.make_task(\n"
+        '    "fusion_gym/LinearFusion-v2", system="plant.yaml", tokens="unlimited",\n'
+        f'    filter="{filter_name}",{trigger}\n)\n```',
+    ]
+    text = [
+        f"# {report.name}",
+        f"By fusion-gym {__version__}.",
+        *summary,
+        "![Error over packets](curves.png)",
+        "## Methods",
+        table(("method", "meaning"), [(name, MEANINGS[name]) for name in report.points]),
+        "## The plant",
+        f"A vector autoregression of the first {report.rows:,} steps without level and daily "
+        "cycle, and its errors on the others under a periodic schedule.",
+        table(RATIOS, criticism_rows(report.criticism)),
+        "\n".join(f"- Warning: {line}." for line in report.warnings) or "No warning.",
+        "## The log",
+        "\n".join(f"- {line}" for line in card_lines(whole)),
+        table(COLUMNS, [card_row(card) for card in whole.card]),
+        "![Readings of all channels](card.png)",
+    ]
+    markdown = "\n\n".join(text) + "\n"
     page = MarkdownIt("commonmark").enable("table").render(markdown)
-    html = templates.get_template("report.html").render(name=report.name, page=page)
     write_text(folder / "report.md", markdown)
-    write_text(folder / "report.html", html)
+    head = f"<!doctype html><meta charset='utf-8'><title>{report.name}</title>"
+    write_text(folder / "report.html", f"{head}<style>{_STYLE}</style>\n{page}")
     write_text(folder / "devices.yaml", devices)
-    return str(vars(rendered)["summary"]).rstrip()
+    return "\n\n".join(summary)
 
 
-def tolerance_table(report: FieldReport) -> str:
-    """Return the table of the packets of each method in the tolerance."""
-    rows = []
+def _rate_lines(report: FieldReport) -> list[str]:
+    """Return the results and the recommendation at equal packets."""
+    best = next(row for row in report.results if row.name == report.best)
+    return [
+        "Errors are shares of the channels' variance; the difference is to practice at equal "
+        "packets, with a 95 % block-bootstrap interval.",
+        results_table(report.results),
+        "## Recommendation",
+        f"{MEANINGS[best.name]} No other method without a downlink has a smaller error. It is "
+        f"{-best.relative.mean:.0%} lower than practice's at equal packets "
+        f"({-best.relative.high:.0%} to {-best.relative.low:.0%}). For practice's error it takes "
+        f"{best.packets:.0%} of the packets.",
+    ]
+
+
+def _tolerance_lines(report: FieldReport) -> list[str]:
+    """Return the packets in the tolerance and the recommendation."""
+    study, rows = report.study, []
+    pairs = zip(report.recording.channels, study.tolerance, strict=True)
+    listed = ", ".join(f"{c.name} {value:g} {c.unit}".strip() for c, value in pairs)
     for name in report.points:
-        excess = report.study.excess(report.point(name).deviations)
+        excess = study.excess(report.point(name).deviations)
         packets = f"{report.packets_a_day(name).sum():.1f}"
         rows.append((name, packets if excess <= 1.0 else "not reached", f"{excess:.2f}"))
-    return table(("method", "packets a day", "largest error over its tolerance"), rows)
+    answer = "No other method without a downlink keeps the tolerance with fewer packets."
+    if study.order(report.point(report.best))[0] > 1.0:
+        answer = "**No setting keeps the tolerance**; the errors below are the least."
+    return [
+        f"Root mean square errors that are allowed: {listed}. Packets are those of all sensors.",
+        table(("method", "packets a day", "largest error over its tolerance"), rows),
+        "## Recommendation",
+        f"{MEANINGS[report.best]} {answer}",
+    ]
 
 
 def results_table(results: Sequence[MethodResult]) -> str:
