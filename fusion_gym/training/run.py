@@ -62,21 +62,33 @@ _LEFT_OUT = ("replay_buffer", "_last_lstm_states")
 _ACTIVITIES = ("environment", "policy", "update", "validation")
 
 
+ValidationRecord = TypedDict(
+    "ValidationRecord",
+    {
+        "timesteps": int,
+        "return": float,
+        "mse": float,
+        "rate": float,
+        "relative_cost": float,
+        "prices": list[dict[str, float]],
+    },
+)
+
+
 @dataclass
 class Journal:
     """The progress of a training.
 
     Args:
         inputs: inputs of the training.
-        records: its validations, each with ``timesteps``, means over the prices, and ``prices``, a
-            table for each price.
+        records: its validations.
         seconds: wall time by activity, over all parts of the training.
         cpu_seconds: processor time without validation, over all parts of the training.
         best: file of the best model.
     """
 
     inputs: Plain
-    records: list[Plain] = field(default_factory=list)
+    records: list[ValidationRecord] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(_ACTIVITIES, 0.0))
     cpu_seconds: float = 0.0
     best: bytes | None = None
@@ -365,7 +377,7 @@ class Progress(Callback):
         scale = self.task.reward.price.scale(
             np.array(self.prices), self.experiment.training.price_exponent
         )
-        record: Plain = {
+        record: ValidationRecord = {
             "timesteps": self.num_timesteps,
             "return": -self.task.horizon * float((scale * costs).mean()),
             "mse": means.mse,
@@ -423,7 +435,7 @@ class Progress(Callback):
         save_checkpoint(self.folder / "latest.zip", self.model, self.environment, self.journal)
 
 
-def log_line(record: Plain) -> str:
+def log_line(record: ValidationRecord) -> str:
     """Return a validation in a few words."""
     return f"MSE {record['mse']:.4f}, rate {record['rate']:.3f}"
 
