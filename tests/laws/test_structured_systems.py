@@ -200,7 +200,7 @@ def test_no_error_without_transmissions_is_negative(place: float, share: float) 
     plant = MarkovJumpPlant.create(options)
     sensors = make_task("fusion_gym/MarkovJumpTracking-v1").plant.sensors
     expected = LinearPlant.create(transition, noise, mean, start).open_loop(50)
-    result = AugmentedModel.create(plant, sensors).open_loop(50)
+    result = AugmentedModel.create(plant, sensors).scales(50)[0]
     np.testing.assert_allclose(result, expected, rtol=1e-6 + 1e-30 * place**2)
 
 
