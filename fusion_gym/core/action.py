@@ -48,7 +48,7 @@ class Action:
         """The action space."""
         return spaces.MultiBinary(self.sensors)
 
-    @property
+    @cached_property
     def factors(self) -> tuple[int, int]:
         """Number D of factors, and number C of choices of each."""
         return self.sensors, 2
@@ -170,7 +170,7 @@ class Sets(Action):
         """See :class:`Action`."""
         return spaces.Discrete(self.factors[1])
 
-    @property
+    @cached_property
     def factors(self) -> tuple[int, int]:
         """See :class:`Action`."""
         return 1, 2**self.sensors
@@ -197,7 +197,7 @@ class Assignment(Action):
         count, choices = self.factors
         return spaces.MultiDiscrete([choices] * count)
 
-    @property
+    @cached_property
     def factors(self) -> tuple[int, int]:
         """See :class:`Action`."""
         return self.channels, self.sensors + 1
@@ -230,7 +230,7 @@ class Single(Assignment):
         """See :class:`Action`."""
         return spaces.Discrete(self.sensors + 1)
 
-    @property
+    @cached_property
     def factors(self) -> tuple[int, int]:
         """See :class:`Action`."""
         return 1, self.sensors + 1

@@ -158,12 +158,12 @@ class Network:
         for part in ("weights", "bucket", "channel", "delay", "acknowledgement"):
             getattr(self, part)  # which checks it
 
-    @property
+    @cached_property
     def rule(self) -> AccessRow:
         """The rule of medium access."""
         return ACCESS[self.options.access]
 
-    @property
+    @cached_property
     def slots(self) -> int:
         """Most grants in a step of a rule with slots; channels of an assignment."""
         return self.options.channels if self.rule.by_channel else self.options.slots
@@ -225,12 +225,12 @@ class Network:
         }
         return {name: size for name, size in sizes.items() if size}
 
-    @property
+    @cached_property
     def _channels(self) -> int:
         """Number of links of each sensor."""
         return self.slots if self.rule.by_channel else 1
 
-    @property
+    @cached_property
     def _longest(self) -> int:
         """Largest delay D, in steps."""
         return len(self.delay) - 1
@@ -274,8 +274,8 @@ class Network:
             admitted = own if readings is None else own & readings
         noise = noise[1:] if self.rule.random else noise
         following = state.draws.following
-        draws = Draws(following)
-        moved = replace(state, admitted=admitted, channel=following, place=None, draws=draws)
+        old = state.tokens, state.queue, state.due, state.true_drop
+        moved = _moved(*old, admitted, following, following)
         return self.draw(moved, noise) if len(noise) else moved
 
     def draw(self, state: NetworkState, noise: Array) -> NetworkState:
@@ -349,8 +349,8 @@ class Network:
             arrival = self.link_probability(state)
             failure = None if arrival is None else 1.0 - arrival[:, 0]
             reception = reception._replace(possible=possible, failure=failure)
-        draws = Draws(state.draws.following)
-        moved = replace(state, tokens=tokens, queue=queue, place=None, due=due, draws=draws)
+        channels = state.channel, state.draws.following
+        moved = _moved(tokens, queue, due, state.true_drop, state.admitted, *channels)
         return moved, Delivery(granted, spent, reception, supposed)
 
     def _lost(
@@ -397,6 +397,19 @@ class Network:
             arrival = arrival - self.channel.drop[0][:, None]
         arrival = self.delay[0] * arrival if self._longest else arrival
         return arrival.reshape(self.sensors, -1, runs)
+
+
+def _moved(
+    tokens: Array,
+    queue: Queue,
+    due: Any,
+    true_drop: Any,
+    admitted: Any,
+    channel: Any,
+    following: Any,
+) -> NetworkState:
+    """Return a state without draws of its own, by its constructor, which is faster than a copy."""
+    return NetworkState(tokens, queue, admitted, channel, None, due, true_drop, Draws(following))
 
 
 def warn_of_uneven_grants(network: Network) -> None:

@@ -193,7 +193,7 @@ class Reward:
         """Price of a token."""
         return Price.create(self.options.cost_weight, self.options.price_range)
 
-    @property
+    @cached_property
     def error_weight(self) -> float:
         """Weight of the error term."""
         return self.options.error_weight

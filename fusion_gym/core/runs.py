@@ -152,7 +152,7 @@ class Runs:
         task, state, requested = self.task, self.state, requests > 0
         silence = task.estimator.reads_silence
         network, delivery = task.network.deliver(state.network, requests, silence)
-        after = receive(task, state, delivery, self.beliefs)._replace(network=network)
+        after = receive(task, state, network, delivery, self.beliefs)
         self.memory.update(self.beliefs, delivery.known)
         self._delivered = after
         estimator, estimate, spent = task.estimator, after.estimate, delivery.spent
@@ -374,12 +374,19 @@ def rank_requests(task: Task, state: NetworkState, known: Any) -> NetworkState:
     return replace(state, place=place_of(task.network.weights * size, state.queue))
 
 
-def receive(task: Task, state: State, delivery: Delivery, beliefs: Callable[[], Beliefs]) -> State:
+def receive(
+    task: Task,
+    state: State,
+    network: NetworkState,
+    delivery: Delivery,
+    beliefs: Callable[[], Beliefs],
+) -> State:
     """Return the states after the packets that arrive at once, and what the sensors suppose.
 
     Args:
         task: The task.
         state: States before the requests.
+        network: The network's state after them.
         delivery: The network's response.
         beliefs: Function that returns the beliefs before the transmission.
     """
@@ -393,7 +400,7 @@ def receive(task: Task, state: State, delivery: Delivery, beliefs: Callable[[], 
     if task.options.packet == "estimate":
         best, spread = beliefs().best
         estimate = estimator.adopt(estimate, best[0], spread[0], np.asarray(arrived.any(0)))
-    return state._replace(estimate=estimate, supposed=supposed, history=history)
+    return State(state.plant, estimate, network, supposed, history, state.known)
 
 
 def settle(task: Task, state: State) -> State:

@@ -278,7 +278,7 @@ class Task(Scenario):
         settings: Options = plain_options(asdict(self.options))
         return settings
 
-    @property
+    @functools.cached_property
     def delayed(self) -> bool:
         """Whether the network delays packets."""
         return len(self.network.delay) > 1

@@ -157,22 +157,22 @@ class TokenBucket:
         """Tokens at the start of an episode."""
         return self._numbers("initial_tokens", at_least=0.0)
 
-    @property
+    @cached_property
     def unlimited(self) -> bool:
         """Whether every request is granted."""
         return self.options.tokens == "unlimited"
 
-    @property
+    @cached_property
     def per_sensor(self) -> bool:
         """Whether each sensor has a bucket of its own."""
         return self.options.budget == "sensor"
 
-    @property
+    @cached_property
     def draws_harvest(self) -> bool:
         """Whether a bucket gains one token with the probability ``rate``."""
         return self.options.harvest == "bernoulli"
 
-    @property
+    @cached_property
     def sharing(self) -> str:
         """Rule of sharing; sensors with their own buckets share nothing, as under ``"equal"``."""
         return "equal" if self.per_sensor else self.options.sharing
