@@ -158,7 +158,7 @@ class Network:
         for part in ("weights", "bucket", "channel", "delay", "acknowledgement"):
             getattr(self, part)  # which checks it
 
-    @cached_property
+    @property
     def rule(self) -> AccessRow:
         """The rule of medium access."""
         return ACCESS[self.options.access]
