@@ -137,10 +137,11 @@ def check(options: Any) -> None:
 @functools.cache
 def _checks(kind: type) -> list[tuple[str, bool, list[Any]]]:
     """Return the fields with checks, whether each may be ``None``, and the checks."""
-    result = []
+    result, first = [], marked(kind, Mark)
     for name, hint in _hints_of(kind).items():
         parts, tables = _parts(hint), _tables(hint)
         checks: list[Any] = [mark for mark in _metadata(hint) if isinstance(mark, Mark)]
+        checks = checks or [mark for key, mark in first.items() if key == name]
         if not checks and all(isinstance(table, Mapping) for table in tables):
             if allowed := tables[0] if tables else choices(hint):
                 checks = [functools.partial(validation.choice, options=allowed)]

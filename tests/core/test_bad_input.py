@@ -1,6 +1,7 @@
 """What cannot be used is refused at once, by an error that names the field and its value."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -10,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from refusals import refused
 from rules import make_rule
 
-from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task, parallel_env
+from fusion_gym import CommonOptions, ConfigurationError, make_sb3_vec_env, make_task, parallel_env
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import present_id
 from fusion_gym.evaluation.episodes import run_episodes
@@ -345,3 +346,15 @@ def test_requests_of_another_kind_move_nothing(backend: str, kind: Any) -> None:
     refused(lambda: batch.step(requests), "requests = [[", "it must be bool")
     np.testing.assert_array_equal(batch.observe(), before)
     np.testing.assert_array_equal(batch.steps, steps)
+
+
+@dataclass(frozen=True)
+class HeavierOptions(CommonOptions):
+    """Another default, without the mark of the option's first declaration."""
+
+    error_weight: float = 2.0
+
+
+def test_limits_hold_where_an_environment_overrides_a_default() -> None:
+    assert HeavierOptions().error_weight == 2.0
+    refused(lambda: HeavierOptions(error_weight=-1.0), "error_weight = -1.0", ">= 0")
