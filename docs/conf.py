@@ -2,6 +2,9 @@
 
 import os
 import sys
+from pathlib import Path
+
+from jupyter_cache import get_cache
 
 from fusion_gym.version import __version__
 
@@ -34,7 +37,8 @@ html_theme_options = {
 # The Python of a page runs in a kernel of its own, in an empty folder; unchanged pages are cached.
 nb_custom_formats = {".md": ("docs.site_extension.read_page", {}, False)}
 nb_execution_mode = "cache"
-nb_execution_cache_path = "runs/docs/notebooks"
+nb_execution_cache_path = str(Path(__file__).parents[1] / "runs/docs/notebooks")
+get_cache(nb_execution_cache_path).get_cache_limit()  # creates its tables, before two processes do
 nb_execution_in_temp = True
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
