@@ -75,11 +75,13 @@ def trace(a: FloatArray) -> FloatArray:
 
 
 def weighted_trace(a: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return Σ w_i a_ii, ``(..., N)``, of ``(..., n, n, N)`` and ``weights`` w (n,)."""
-    total = weights[0] * a[..., 0, 0, :]
+    """Return Σ w_i a_ii or tr(W a), ``(..., N)``, of ``(..., n, n, N)``, w (n,) or W (n, n)."""
+    if weights.ndim > 1:
+        return total(total(weights[..., None] * a))
+    result = weights[0] * a[..., 0, 0, :]
     for k in range(1, a.shape[-2]):
-        total += weights[k] * a[..., k, k, :]
-    return total
+        result += weights[k] * a[..., k, k, :]
+    return result
 
 
 def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
@@ -177,6 +179,11 @@ def dot(u: FloatArray, v: FloatArray) -> FloatArray:
 def quadratic(v: FloatArray, a: FloatArray) -> FloatArray:
     """Return ``v^T a v``, ``(..., N)``, of ``(..., n, N)`` and ``(..., n, n, N)``."""
     return dot(v, matvec(a, v))
+
+
+def weighted_square(v: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return Σ w_i v_i² or v^T W v, ``(..., N)``, of ``(..., n, N)``, w (n, 1) or W (n, n, 1)."""
+    return total(weights * (v * v)) if weights.ndim == 2 else quadratic(v, weights)
 
 
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:

@@ -244,7 +244,7 @@ class Beliefs(ABC):
         return gain if self.arrival is None else self.arrival * gain
 
     def _weighted(self, difference: Array) -> Array:
-        return linalg.total(self.task.relative_weights * (difference * difference))
+        return linalg.weighted_square(difference, self.task.relative_weights)
 
     def _no_packets(self, runs: int) -> Packets:
         return np.zeros((self.task.sensors, runs), dtype=np.bool_)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import STATES
 from fusion_gym.core.knowledge import Block, Knowledge, covers, numbered
@@ -106,7 +107,8 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         return ()
     nominal = task.open_loop if task.nominal_error is None else task.nominal_error[:, None]
     deviation = np.sqrt(np.where(nominal > 0.0, nominal, 1.0))
-    whole = float((task.relative_weights * nominal).sum())
+    weights = task.relative_weights
+    whole = float(((weights if weights.ndim == 2 else linalg.diagonal(weights)) * nominal).sum())
 
     def difference(beliefs: Beliefs) -> Array:
         scaled = _DIFFERENCE * beliefs.difference / deviation
@@ -131,7 +133,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         meaning=f"{_VALUE:g} sign(u) √|u|, u the squared norm of x* − x̂ (nobody) or v(m), over the "
         "nominal error",
         limit=_VALUE_LIMIT,
-        constants={"nominal error": whole, "squared norm": task.relative_weights[:, 0]},
+        constants={"nominal error": whole, "squared norm": weights[..., 0]},
     )
     if owner == "own":
         own: Any = {"knowledge": "own_memory" if task.options.memory else "own", "node": "own"}

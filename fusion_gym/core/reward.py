@@ -33,10 +33,27 @@ def equal_weights(open_loop: Array) -> Array:
     return 1.0 / (len(open_loop) * open_loop)
 
 
+def checked_weights(value: ArrayLike, states: int) -> Array:
+    """Return weights (n,) or a matrix (n, n) with entries off its diagonal."""
+    name, shape = "state_weights", validation.array_shape(value)
+    if shape is None or len(shape) < 2:
+        return validation.not_negative(name, value, (states,))
+    matrix = validation.covariance(name, value, states)
+    diagonal: Array = np.diagonal(matrix)
+    return matrix if np.count_nonzero(matrix - np.diag(diagonal)) else diagonal.copy()
+
+
+def _separate(weights: Array, where: str) -> Array:
+    """Return weights (n,), or refuse a matrix."""
+    if weights.ndim > 1:
+        raise validation.refusal("state_weights", weights, "a number for each state", where)
+    return weights
+
+
 def reward_weights(
     options: RewardOptions, state_weights: ArrayLike | None, open_loop: Array
 ) -> Array:
-    """Return the checked weights (n,) of the states' squared errors.
+    """Return the checked weights (n,) or (n, n) of the states' errors.
 
     Args:
         options: Options with a number or ``None`` as ``reward_scale``.
@@ -52,18 +69,19 @@ def reward_weights(
     if options.reward_scale is not None:
         factor = validation.number("reward_scale", options.reward_scale, above=0.0)
         ratios = np.ones(()) if weights is None else weights
-        weights = factor * validation.not_negative("state_weights", ratios, open_loop.shape)
+        weights = factor * checked_weights(ratios, len(open_loop))
     if weights is None:
         if not open_loop.sum() > 0.0:
             raise _at_rest(open_loop)
         weights = np.full(open_loop.shape, 1.0 / open_loop.sum())
-    result = validation.not_negative("state_weights", weights, open_loop.shape)
-    weight = options.error_weight
-    if not weight * (result @ open_loop) <= _LARGEST:
+    result, weight = checked_weights(weights, len(open_loop)), options.error_weight
+    deviation = np.sqrt(open_loop)
+    most = result @ open_loop if result.ndim == 1 else deviation @ abs(result) @ deviation
+    if not weight * most <= _LARGEST:
         raise ConfigurationError(
             f"error_weight = {weight:g} is not allowed with state_weights = "
             f"{validation.display(result)}: without transmissions the error may cost up to "
-            f"{_LARGEST:g} a step, not {weight * (result @ open_loop):g}"
+            f"{_LARGEST:g} a step, not {weight * most:g}"
         )
     return result
 
@@ -133,9 +151,10 @@ class RewardOptions(OptionGroup):
     rules without a delay: it takes the prices at which the best value of information with memory
     sends 60 and 12 % of the sustained rate, but at least two packets per sensor and episode."""
     state_weights: ArrayLike | None = None
-    """Weights of the states' squared errors in the reward. The default is the environment's own,
-    which ``help`` shows. Explicit weights also weigh the trace that covariance intersection
-    minimises, which is plain by default."""
+    """Weights of the states' squared errors in the reward, or a matrix W of eᵀWe. The default is
+    the environment's own, which ``help`` shows. Explicit weights also weigh the trace that
+    covariance intersection minimises, which is plain by default; a rule or a signal with such a
+    trace refuses a matrix."""
     reward_scale: float | Literal["auto"] | None = "auto"
     """Factor of the state weights. ``"auto"`` simulates requests at an even pace and takes the
     factor with which their error costs 1 per step; explicit ``state_weights`` are not scaled. The
@@ -144,10 +163,10 @@ class RewardOptions(OptionGroup):
     transmissions."""
 
     def own_weights(self, states: int) -> Array | None:
-        """Return the checked ``state_weights`` (n,), or ``None`` without them."""
+        """Return the checked ``state_weights`` (n,), or ``None`` without them; refuse a matrix."""
         if self.state_weights is None:
             return None
-        return validation.not_negative("state_weights", self.state_weights, (states,))
+        return _separate(checked_weights(self.state_weights, states), "here")
 
 
 @dataclass(frozen=True)
@@ -158,10 +177,10 @@ class Reward:
 
     Args:
         options: The options.
-        state_weights: Weights w (n, 1).
-        error: ``"squared"`` is D = Σᵢ wᵢ eᵢ², ``"maximum"`` D = maxᵢ wᵢ eᵢ², ``"trace"`` D = Σᵢ wᵢ
-            Pᵢᵢ, which a policy can exploit. A function takes e and P and returns D (N,) >= 0
-            without the weights w.
+        state_weights: Weights w (n, 1), or W (n, n, 1).
+        error: ``"squared"`` is D = Σᵢ wᵢ eᵢ² or eᵀWe, ``"maximum"`` D = maxᵢ wᵢ eᵢ², ``"trace"``
+            D = Σᵢ wᵢ Pᵢᵢ or tr(WP), which a policy can exploit. A function takes e and P, and
+            returns D (N,) >= 0 without the weights.
     """
 
     options: RewardOptions
@@ -176,7 +195,7 @@ class Reward:
 
         Args:
             options: The options.
-            state_weights: Weights (n,) (:func:`reward_weights`).
+            state_weights: Weights (n,) or (n, n) (:func:`reward_weights`).
             error: A kind, a function, or its ``module:name``, in place of the option.
 
         Raises:
@@ -184,9 +203,21 @@ class Reward:
                 is not allowed.
         """
         cost = _cost(options.error if error is None else error, len(state_weights))
-        reward = cls(options, state_weights[:, None], cost)
+        if cost == "maximum":
+            _separate(state_weights, "with error='maximum'")
+        reward = cls(options, state_weights[..., None], cost)
         reward.price  # noqa: B018  which checks it
         return reward
+
+    def separate_weights(self, where: str) -> Array:
+        """Return the weights (n,), or refuse a matrix, with the place."""
+        return _separate(self.state_weights[..., 0], where)
+
+    @cached_property
+    def diagonal(self) -> Array:
+        """Weights (n, 1) of the states' squared errors: of a matrix its diagonal."""
+        weights = self.state_weights
+        return weights if weights.ndim == 2 else linalg.diagonal(weights)
 
     @cached_property
     def price(self) -> Price:
@@ -221,8 +252,10 @@ class Reward:
 
     def _error_cost(self, error: Array, covariance: Array) -> Array:
         if self.error == "squared":
-            return linalg.total(self.state_weights * (error * error))
+            return linalg.weighted_square(error, self.state_weights)
         if self.error == "trace":
+            if self.state_weights.ndim > 2:
+                return linalg.weighted_trace(covariance, self.state_weights[..., 0])
             return linalg.total(self.state_weights * linalg.diagonal(covariance))
         if self.error == "maximum":
             return (self.state_weights * (error * error)).max(0)
@@ -243,14 +276,20 @@ class Reward:
             error: x - x̂ (n, …).
             reference_error: x - x* (n, …).
         """
+        weights = self.state_weights[..., 0]
+        matrix = weights.ndim > 1
+
+        def square(values: Array) -> Array:
+            return values * np.tensordot(weights, values, axes=1) if matrix else values * values
+
         if kind == "mismatch":
-            squared = (error - reference_error) ** 2
+            squared = square(error - reference_error)
         elif kind == "excess":
-            squared = error * error - reference_error * reference_error
+            squared = square(error) - square(reference_error)
         else:
-            squared = error * error
-        result = -self.error_weight * np.tensordot(self.state_weights[:, 0], squared, axes=1)
-        return np.asarray(result)
+            squared = square(error)
+        each = np.ones(len(weights)) if matrix else weights
+        return np.asarray(-self.error_weight * np.tensordot(each, squared, axes=1))
 
 
 @dataclass(frozen=True)

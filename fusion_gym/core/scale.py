@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion_gym import seeds, validation
+from fusion_gym import linalg, seeds, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.network import Network
@@ -35,7 +35,7 @@ def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array 
     """Return the options with numbers for ``"auto"``, and the nominal error or ``None``."""
     error, factor = None, options.reward_scale
     if factor is not None:
-        error, whole = _stored(_nominal, options.nominal(), build)
+        error, whole = _stored(nominal_error, options.nominal(), build)
         if not _is_auto(factor):
             factor = validation.number("reward_scale", factor, above=0.0)
         elif options.state_weights is not None:
@@ -106,20 +106,24 @@ def sustained_tokens(task: Task) -> float:
     return float((_packets(task.network) * task.network.bucket.round_cost).sum())
 
 
-def nominal_error(task: Task) -> Array:
-    """Return each state's mean squared error (n,) with requests at an even pace."""
-    rate, sensors = nominal_rate(task.network), task.sensors
-    if rate == 0.0:
-        return task.open_loop[:, 0]
-    batch = _batch(task, _RUNS, 1)
+def nominal_error(task: Task) -> tuple[Array, float]:
+    """Return each state's mean squared error (n,) with requests at an even pace, and its cost."""
+    rate, sensors, weights = nominal_rate(task.network), task.sensors, task.reward.state_weights
+    separate = weights.ndim == 2
+    if rate == 0.0 and separate:
+        return task.open_loop[:, 0], float(weights[:, 0] @ task.open_loop[:, 0])
+    batch, cost = _batch(task, _RUNS, 1), 0.0
     total = np.zeros(len(task.open_loop))
     due = np.repeat(np.arange(sensors)[:, None] / sensors + _ROUNDING, _RUNS, axis=1)
     for _ in range(batch.task.horizon):
         due += rate
         requests = (due >= 1.0) & batch.admitted()
         due -= requests
-        total += batch.step(requests).squared_error.mean(-1)
-    return total / batch.task.horizon
+        outcome = batch.step(requests)
+        total += outcome.squared_error.mean(-1)
+        cost += float(linalg.weighted_square(outcome.error, weights).mean())
+    error, steps = total / batch.task.horizon, batch.task.horizon
+    return error, float(weights[:, 0] @ error) if separate else cost / steps
 
 
 def price_range(task: Task) -> tuple[float, float]:
@@ -150,17 +154,12 @@ def prices_at(spent: Array, error: Array, tokens: Array) -> Array:
     return np.exp(np.interp(np.log(tokens), np.log(middle), slopes))
 
 
-def _nominal(task: Task) -> tuple[Array, float]:
-    error = nominal_error(task)
-    return error, float(task.reward.state_weights[:, 0] @ error)
-
-
 def _sweep(task: Task) -> tuple[Array, Array]:
     """Return tokens and error per step (rules,) of value-of-information rules on the same noise."""
     share = _WORK / (task.sensors * len(task.open_loop) ** 2)
     runs = int(np.clip(_RUNS * share, 4, _RUNS))
     ratio, count = (2, 21) if runs > 4 else (4, 9)
-    usual = task.error_scale * float((task.relative_weights[:, 0] * nominal_error(task)).sum())
+    usual = task.reward.error_weight * nominal_error(task)[1]
     levels = usual / float(task.network.bucket.cost.mean()) * np.geomspace(3e-3, 3e2, count)
     counts = ratio ** np.arange(1 + int(math.log(task.sensors, ratio)))
     least = np.tile(np.repeat(levels, runs), len(counts)) * task.network.bucket.cost

@@ -117,7 +117,7 @@ class Scenario:
         options: The options.
         plant: The truth and its sensors.
         estimator: The local filters and the fusion centre.
-        state_weights: Weights (n,) of the squared errors in the reward if the options have none;
+        state_weights: Weights (n,) or (n, n) of the errors in the reward if the options have none;
             ``None`` weighs all states equally. ``reward_scale`` multiplies them.
         policy_defaults: Parameters of named policies in this scenario.
         feedback: Whether every node receives the centre's estimate by construction.
@@ -165,8 +165,8 @@ _MOST_DISCRETE = 16  # sensors with a discrete action of 2^sensors values
 class Task(Scenario):
     """The definition of an environment, independent of the number of runs.
 
-    It is a scenario whose options have numbers instead of ``"auto"``. Its ``state_weights`` (n,)
-    are the weights of the reward, and its ``memory_estimator`` is ``None`` without memory.
+    It is a scenario whose options have numbers instead of ``"auto"``. Its ``state_weights`` are the
+    weights of the reward, and its ``memory_estimator`` is ``None`` without memory.
 
     Args:
         nominal_error: Mean squared errors (n,) that scale belief entries
@@ -307,14 +307,14 @@ class Task(Scenario):
     @functools.cached_property
     def error_scale(self) -> float:
         """Weight of a squared error in the reward, averaged over the states."""
-        return float(self.reward.error_weight * self.reward.state_weights.mean())
+        return float(self.reward.error_weight * self.reward.diagonal.mean())
 
     @functools.cached_property
     def relative_weights(self) -> Array:
-        """The reward's weights of the states (n, 1), scaled to a mean of 1; 1 if all are zero."""
+        """The reward's weights, scaled to a mean of the diagonal of 1; 1 if all are zero."""
+        mean = float(self.reward.diagonal.mean())
         weights = self.reward.state_weights
-        mean = float(weights.mean())
-        return weights / mean if mean > 0.0 else np.ones_like(weights)
+        return weights / mean if mean > 0.0 else np.ones_like(self.reward.diagonal)
 
     @property
     def hidden_signals(self) -> tuple[str, ...]:

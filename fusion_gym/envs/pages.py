@@ -54,7 +54,7 @@ def page(env_id: str, task: Task | None = None) -> str:
     versions = [text for text in description if re.match(r"v\d+: ", text)]
     if kind.__module__.startswith("fusion_gym."):
         versions.insert(0, _SECOND if kind().sharing == "turns" else _SECOND.replace(_QUEUE, ""))
-    weights = task.reward.state_weights[:, 0]
+    weights = task.reward.state_weights[..., 0]
     return _PAGE.read_text(encoding="utf-8").format(
         description="\n\n".join(text for text in description if not re.match(r"v\d+: ", text)),
         actions=space_text(view.action.space),
@@ -65,7 +65,7 @@ def page(env_id: str, task: Task | None = None) -> str:
         legend=LEGEND,
         table=observation_table(task),
         weights=short(weights),
-        open_loop=f"{float(weights @ plant.open_loop(task.horizon)):.3g}",
+        open_loop=f"{float(task.reward.diagonal[:, 0] @ plant.open_loop(task.horizon)):.3g}",
         horizon=task.horizon,
         options=kind.__name__,
         arguments="\n".join(f"    {plain_marks(line)}" for line in list_options(options_in(kind))),

@@ -235,7 +235,7 @@ class Rollout:
             best = branch.beliefs().best.mean[0]
             spent = branch.deliver(requests).cost
             missed = best - self._task.estimator.mean(branch.delivered.estimate)
-            cost += linalg.total(self._weights * missed * missed) + price * spent
+            cost += linalg.weighted_square(missed, self._weights) + price * spent
             if step < self.steps:
                 branch.sense(noise[step].take(lanes, axis=-1))
                 requests = np.asarray(self._decision(branch.signals()))

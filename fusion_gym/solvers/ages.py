@@ -55,7 +55,7 @@ def age_sources(task: Task, longest: int = _LONGEST) -> tuple[AgeSource, ...]:
     if not isinstance(model, AgedSources):
         raise validation.refusal("sources", None, "vector sources", "for costs by age")
     channel = network.channel or Channel(ChannelOptions(), task.sensors)
-    weights = task.reward.error_weight * task.reward.state_weights
+    weights = task.reward.error_weight * task.reward.separate_weights("here")[:, None]
     costs = model.age_costs(weights, longest + _BEYOND)
     links = network.slots if network.rule.by_channel else 1
     every = [own for own in costs.T for _ in range(links)]

@@ -67,7 +67,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     if reward.price.fixed is None:
         raise validation.refusal("cost_weight", "random", "a number", "for the optimum")
     channel = channel or Channel(ChannelOptions(), task.sensors)
-    weights = reward.error_weight * reward.state_weights[:, 0]
+    weights = reward.error_weight * reward.separate_weights("for the optimum")
     return tuple(
         SourceProblem.create(
             coefficient=float(system.coefficient[i]),

@@ -119,6 +119,7 @@ def cost_bound(
     Raises:
         ConfigurationError: a task without this bound, or a value that is not allowed.
     """
+    task.reward.separate_weights("for the bound")
     model = silence_model(task, task.error_scale * task.relative_weights[:, 0])
     packet = validation.number("price", price, above=0.0) * float(task.network.bucket.cost.min())
     problem = replace(model.problem, price=packet)

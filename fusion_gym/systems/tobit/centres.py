@@ -720,7 +720,9 @@ def feedback_centre(options: Any, node: NodeFilter) -> Centre:
     """
     sensors = node.sensors.count
     kind = "federated" if options.fusion is None else options.fusion
-    weights = options.own_weights(node.sensors.measurement_matrix.shape[2])
+    weights = None
+    if kind != "federated":  # which minimises no trace
+        weights = options.own_weights(node.sensors.measurement_matrix.shape[2])
     fusion = choose_rule(kind, STRUCTURE, sensors, options.order, weights)
     if kind == "federated":
         share = information_shares(options.information_shares, sensors)
