@@ -15,6 +15,7 @@ from fusion_gym.version import __version__
 
 if TYPE_CHECKING:
     from fusion_gym import evaluation, jax, zoo
+    from fusion_gym.core.control import Controller
     from fusion_gym.core.estimator import Estimator, Reception
     from fusion_gym.core.knowledge import Block, Signal, age_block
     from fusion_gym.core.plant import Plant
@@ -33,6 +34,7 @@ __all__ = [
     "Block",
     "CommonOptions",
     "ConfigurationError",
+    "Controller",
     "Estimator",
     "Experiment",
     "FusionEnv",
@@ -65,6 +67,7 @@ __all__ = [
 
 # Names that are imported on first access, by module; some need an extra.
 _PLACES = {
+    "core.control": ("Controller",),
     "core.estimator": ("Estimator", "Reception"),
     "core.knowledge": ("Block", "Signal", "age_block"),
     "core.plant": ("Plant",),

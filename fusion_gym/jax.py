@@ -25,7 +25,7 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Outcome, Position, advance, start_of
 from fusion_gym.core.task import CommonOptions, Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.envs.vector import step_infos
+from fusion_gym.envs.vector import ends_of, step_infos
 from fusion_gym.envs.views import SchedulerView
 from fusion_gym.errors import refusal
 from fusion_gym.systems.solvable import ParametricEstimator
@@ -169,9 +169,8 @@ class FunctionalEnv:
             return jax.tree.map(functools.partial(jnp.where, ended), fresh, moved)
 
         moved = jax.lax.cond(ended.any(), renew, lambda moved: moved, moved)
-        terminated = ended & task.options.clock
         info = step_infos(outcome) | {"final_observation": last}
-        results = outcome.reward, terminated, ended & ~terminated, info
+        results = outcome.reward, *ends_of(task, outcome), info
         return self._runs(task, moved).observe(), moved, results
 
     def reset_env(

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import pydantic
 
@@ -48,10 +48,14 @@ class Quantiles(pydantic.BaseModel):
 
 # A policy in the JSON of an evaluation: an interval for a metric, or a list.
 _Row = Annotated[list[float], pydantic.Field(min_length=1)]
-_FIELDS: Arguments = {
-    name: (_Row if metric.axis else metrics.Interval, ...)
-    for name, metric in metrics.METRICS.items()
-}
+
+
+def _field(metric: metrics.Metric) -> tuple[Any, Any]:
+    kind: Any = _Row if metric.axis else metrics.Interval
+    return (kind | None, None) if metric.loop else (kind, ...)
+
+
+_FIELDS: Arguments = {name: _field(metric) for name, metric in metrics.METRICS.items()}
 EVALUATED = pydantic.create_model("EVALUATED", **_FIELDS)
 
 

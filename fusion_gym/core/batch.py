@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array, Lazy, merge_runs
 from fusion_gym.core.access import check_requests
+from fusion_gym.core.control import inputs_of
 from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
@@ -151,14 +152,16 @@ class EpisodeBatch(Runs):
         start, announcement = start_of(task, noise)
         state = advance(task, start, row, self.steps[runs])
         first, measurement = (task.plant.measurement(part.plant) for part in (start, state))
-        self.memory.begin(first, announcement, measurement, runs, keys, self.num_envs)
+        own = first, announcement, measurement, runs, keys, self.num_envs
+        self.memory.begin(*own, start.control)
         if self.reference is not None and not self._shared:
-            beside = self.reference.predict(self.reference.start(first, announcement))
+            beside = self.reference.start(first, announcement)
+            beside = self.reference.predict(beside, *inputs_of(start.control))
             beside = self.reference.observe(beside, measurement)
             self._full_state = beside if everyone else merge_runs(self._full_state, beside, runs)
         if len(task.network.delay) > 1:
             nothing = np.zeros((task.sensors, len(runs)), dtype=np.bool_)
-            last = state.estimate, measurement, nothing
+            last = state.estimate, measurement, nothing, state.control
             state = state._replace(history=(last,) * (len(task.network.delay) - 1))
         self.state = state if everyone else merge_runs(self.state, state, runs)
 
@@ -199,7 +202,7 @@ class EpisodeBatch(Runs):
             self._move()
             self.sense(self.normals())
         if self.reference is not None and not self._shared:
-            predicted = self.reference.predict(self._full_state)
+            predicted = self.reference.predict(self._full_state, *inputs_of(self.state.control))
             measurement = self.task.plant.measurement(self.state.plant)
             self._full_state = self.reference.observe(predicted, measurement)
         self.finished = np.array(outcome.ended, ndmin=1)

@@ -57,7 +57,7 @@ class RowStep:
             start, announcement = start_of(task, self.start_noise)
             state = advance(task, start, self.noise, steps)
             measured = (plant.measurement(part.plant) for part in (start, state))
-            memory = self.begin_memory(announcement, *measured)
+            memory = self.begin_memory(announcement, start.control, *measured)
             self.template = Position(state, number, steps, steps), memory.states
             branch = Branch(task, memory, layout, self.template[0])
             branch.deliver(np.zeros((task.sensors, 1), np.bool_))
@@ -67,6 +67,8 @@ class RowStep:
         observation = np.zeros((len(layout.names), 1), np.float32)
         self.inputs = arrays_of(self.template)
         outcome = [*[number] * 4, *[flags] * 3, errors, errors, *[flags[0]] * 2]
+        if state.control is not None:
+            outcome += [number, state.control]
         self.results = [*outcome, *arrays_of(self._delivered)]
         self.arrays = [*self.inputs, *self.results, observation]
         *self._places, self._entries = _places(self.arrays)
@@ -89,10 +91,10 @@ class RowStep:
         """Number of entries of a row."""
         return int(self._entries.stop)
 
-    def begin_memory(self, announcement: Any, first: Any, measurement: Any) -> Memory:
-        """Return the memory of one run after the plant's announcement and two measurements."""
+    def begin_memory(self, announcement: Any, control: Any, first: Any, measurement: Any) -> Memory:
+        """Return the memory of one run after announcement, input and two measurements."""
         memory = self.runs[1].with_states({})
-        memory.begin(first, announcement, measurement, np.arange(1), [0], 1)
+        memory.begin(first, announcement, measurement, np.arange(1), [0], 1, control)
         return memory
 
     def begin_run(self, noise: Any, first: Any, price: Any, limit: Any) -> Branch:
@@ -103,7 +105,7 @@ class RowStep:
         position = Position(advance(task, start, first, steps), price, steps, limit)
         position = map_arrays(asarray, position)
         measured = (task.plant.measurement(part.plant) for part in (start, position.state))
-        memory = self.begin_memory(announcement, *measured)
+        memory = self.begin_memory(announcement, start.control, *measured)
         memory.states = map_arrays(asarray, memory.states)
         return Branch(task, memory, layout, position)
 
@@ -120,7 +122,8 @@ class RowStep:
         branch = Branch(task, memory.with_states(states), layout, position)
         outcome = branch.step(requests, noise)
         moved = branch.position(), branch.memory.states
-        return [*arrays_of(moved), *outcome, *arrays_of(branch.delivered), branch.observe()]
+        after = arrays_of(outcome), arrays_of(branch.delivered)
+        return [*arrays_of(moved), *after[0], *after[1], branch.observe()]
 
     def pack(self, position: Position, memory: MemoryStates) -> Array:
         """Return the rows of a position and of the memory's states."""
@@ -153,7 +156,8 @@ class RowStep:
         row = slice(None) if run is None else run
         numbers = rows[row, self._span].T.copy()  # or a stored reward would keep the rows
         flags: Any = numbers.astype(np.bool_)
-        return Outcome._make([(flags if flag else numbers)[at] for flag, at in self._fields])
+        values: Any = ((flags if flag else numbers)[at] for flag, at in self._fields)
+        return Outcome(*values)
 
     def observation(self, rows: Array) -> NDArray[np.float32]:
         """Return new observations (N, entries) of rows."""

@@ -95,6 +95,8 @@ class Estimator(ABC, Generic[StateT]):
     def predict(self, state: StateT) -> StateT:
         """Return the state one step later, before a measurement.
 
+        With a :class:`~fusion_gym.core.control.Controller` it takes the input ``control`` (k, N).
+
         Args:
             state: State after :meth:`update` or :meth:`start`.
         """

@@ -60,7 +60,7 @@ class ObservationOptions(OptionGroup):
     excludes the value."""
     horizon: Annotated[int, Scaling(), Mark(validation.integer, at_least=1)] = 100
     """Steps of an episode. The open-loop error over the horizon scales reward and observation."""
-    clock: bool = False
+    clock: Annotated[bool, Scaling()] = False
     """Whether the observation shows the steps left; the end of an episode is then a termination."""
     information: Literal["sensors", "centre"] = "sensors"
     """Content of the observation: the new measurements of all sensors (``"sensors"``), or only the
@@ -128,7 +128,7 @@ class Signal:
         axes: Axes of the array, such as ``"(sensors, m, N)"``, the batch axis N last.
         meaning: Short description.
         node: Part of the centre's knowledge that a local sensor has: its row of the first axis
-            (``"own"``) or none (``"hidden"``).
+            (``"own"``), all of it (``"broadcast"``) or none (``"hidden"``).
 
     Example:
         >>> from fusion_gym import Signal
@@ -140,15 +140,15 @@ class Signal:
     knowledge: Knowledge
     axes: str
     meaning: str
-    node: Literal["own", "hidden"] = "hidden"
+    node: Literal["own", "broadcast", "hidden"] = "hidden"
 
     def __post_init__(self) -> None:
         validation.choice("knowledge", self.knowledge, KNOWLEDGE)
-        validation.choice("node", self.node, ("own", "hidden"))
+        validation.choice("node", self.node, ("own", "broadcast", "hidden"))
 
     def known_to(self, knower: Knowledge) -> bool:
         """Return whether a policy of this class may read the signal, or a sensor its row."""
-        node = self.knowledge == "centre" and self.node == "own"
+        node = self.knowledge == "centre" and self.node != "hidden"
         return covers(knower, self.knowledge) or (node and covers(knower, "own"))
 
 
@@ -232,6 +232,9 @@ NETWORK_SIGNALS = (
         "probability that a packet sent now on this channel of an assignment arrives now",
         "own",
     ),
+)
+CONTROL_SIGNAL = Signal(
+    "control", "centre", "(k, N)", "the last input of a controller", "broadcast"
 )
 # For policies that plan, and for saved agents.
 PLANNING_SIGNALS = (

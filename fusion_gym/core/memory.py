@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array, Lazy, map_arrays, merge_runs, take_runs, value_of
+from fusion_gym.core.control import inputs_of
 from fusion_gym.core.estimator import Estimator, Reception
 from fusion_gym.core.task import ONE_STEP, Task
 from fusion_gym.errors import refusal
@@ -54,7 +55,8 @@ class MemoryPart(NamedTuple):
     It is of ``kind`` ``"every"`` with all measurements, ``"own"`` with one sensor's measurements
     and received packets, or ``"single"``, a centre with deliveries from that sensor only. Its state
     has ``copies`` · N columns, a sensor's runs adjacent. A ``private`` state has no packets of
-    others. ``sensor`` is the only one that the estimator has; ``None`` is all.
+    others. ``sensor`` is the only one that the estimator has; ``None`` is all. Runs with the same
+    noise have different measurements where the loop is ``closed``.
     """
 
     kind: Kind
@@ -62,11 +64,12 @@ class MemoryPart(NamedTuple):
     copies: int
     private: bool
     sensor: int | None = None
+    closed: bool = False
 
     @property
     def shared(self) -> bool:
         """Whether runs with the same noise have the same state."""
-        return self.private and not self.estimator.reads_silence
+        return self.private and not self.estimator.reads_silence and not self.closed
 
     def rows(self, values: Any) -> Any:
         """Return the estimator's sensors among values (sensors, …)."""
@@ -440,9 +443,8 @@ class Memory:
             if own:
                 self._add("own", task.memory_estimator, private=broadcast != "packets")
             else:
-                self.parts["every"] = MemoryPart(
-                    "every", task.memory_estimator, copies=1, private=True
-                )
+                memory, closed = task.memory_estimator, task.controller is not None
+                self.parts["every"] = MemoryPart("every", memory, 1, private=True, closed=closed)
         if own and (broadcast == "none" or (broadcast == "estimate" and not task.feedback)):
             self._add("single", task.estimator, private=False)
         self.keeps_every = "every" in self.parts
@@ -464,11 +466,13 @@ class Memory:
     def _add(self, kind: Kind, estimator: Any, private: bool) -> None:
         """Add a part for each sensor where the estimator allows it, else one with copies."""
         alone = [estimator.select_sensor(i) for i in range(self.task.sensors)]
+        closed = self.task.controller is not None
         if (private or kind == "single") and None not in alone:
             for sensor, own in enumerate(alone):
-                self.parts[f"{kind} {sensor}"] = MemoryPart(kind, own, 1, private, sensor)
+                self.parts[f"{kind} {sensor}"] = MemoryPart(kind, own, 1, private, sensor, closed)
         else:
-            self.parts[kind] = MemoryPart(kind, estimator, self.task.sensors, private)
+            copies = self.task.sensors
+            self.parts[kind] = MemoryPart(kind, estimator, copies, private, closed=closed)
 
     def begin(
         self,
@@ -478,6 +482,7 @@ class Memory:
         runs: NDArray[np.int64],
         keys: Sequence[Any],
         num_envs: int,
+        control: Array | None = None,
     ) -> None:
         """Start in the R runs ``runs``, and observe.
 
@@ -488,6 +493,7 @@ class Memory:
             runs: Numbers of the runs (R,).
             keys: Keys of the runs' noise (R,).
             num_envs: Number of all runs.
+            control: Input (k, R) between the two measurements, with a controller.
         """
         together, old = len(runs) == num_envs, self.whole(num_envs)
         self.places = self._first = self._beliefs = None
@@ -507,7 +513,7 @@ class Memory:
                 values = {field: take_runs(getattr(state, field), first_run) for field in fields}
                 state = replace(state, **values)
             self.states[name] = state
-        self.observe(measurement)
+        self.observe(measurement, control)
         if not together:
             for name, state in self.states.items():
                 places = self.parts[name].places(runs, num_envs)
@@ -534,16 +540,17 @@ class Memory:
         if self.states:
             self.states = self._updated(beliefs(), arrived)
 
-    def observe(self, measurement: Array) -> None:
-        """Predict, and take the new measurements (sensors, m, N)."""
+    def observe(self, measurement: Array, control: Array | None = None) -> None:
+        """Predict with the input (k, N), and take the new measurements (sensors, m, N)."""
         states, self._beliefs = {}, None
         for name, state in self.states.items():
             part, own = self.parts[name], self.parts[name].rows(measurement)
             if part.shared and self._first is not None:
                 own = own[..., self._first]
+            moving: Any = inputs_of(control)
             if part.copies > 1:
-                own = namespace(own).tile(own, part.copies)
-            states[name] = part.estimator.observe(part.estimator.predict(state), own)
+                own, *moving = (namespace(own).tile(item, part.copies) for item in (own, *moving))
+            states[name] = part.estimator.observe(part.estimator.predict(state, *moving), own)
         self.states = states
 
     def forget(self) -> None:

@@ -233,6 +233,8 @@ class Plant(ABC, Generic[StateT]):
     def sense(self, state: StateT, noise: Array) -> StateT:
         """Return the state after a step of the plant and the new measurements.
 
+        With a :class:`~fusion_gym.core.control.Controller` it takes the input ``control`` (k, N).
+
         Args:
             state: Any state.
             noise: Standard normals (noise_channels, N).

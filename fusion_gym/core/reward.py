@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.declaration import Mark, OptionGroup
+from fusion_gym.declaration import Mark, OptionGroup, Scaling
 from fusion_gym.errors import forbidden
 from fusion_gym.importing import import_named, name_of
 from fusion_gym.namespace import namespace
@@ -141,6 +141,9 @@ class RewardOptions(OptionGroup):
     """Error term of the reward: ``"squared"`` is Σ w_i e_i², ``"trace"`` is Σ w_i P_ii of the
     claimed covariance P (which a policy can exploit), ``"maximum"`` is max w_i e_i². Otherwise a
     function of errors and covariances, or its ``"module:name"``."""
+    objective: Annotated[Literal["estimation", "control"] | None, Scaling()] = None
+    """Meaning of the error term: ``"estimation"`` is the option ``error``, ``"control"`` is the
+    cost of state and input, the default with a controller."""
     error_weight: Annotated[float, Mark(validation.number, at_least=0.0)] = 1.0
     """Weight of the reward's error term."""
     cost_weight: float | Literal["random"] = 0.5
@@ -160,7 +163,8 @@ class RewardOptions(OptionGroup):
     factor with which their error costs 1 per step; explicit ``state_weights`` are not scaled. The
     pace is half of the sustained rate, or a quarter of all packets with unlimited tokens. These
     errors also scale the entries of ``belief_features``. ``None`` uses the error without
-    transmissions."""
+    transmissions, and leaves the cost of a controller as it is, which the factor else multiplies as
+    well."""
 
     def own_weights(self, states: int) -> Array | None:
         """Return the checked ``state_weights`` (n,), or ``None`` without them; refuse a matrix."""
@@ -249,6 +253,16 @@ class Reward:
             ConfigurationError: A user's function returns no numbers >= 0 of shape (N,).
         """
         return -self.error_weight * self._error_cost(error, covariance), -price * spent
+
+    def control_term(self, cost: Array) -> Array:
+        """Return the error term (N,) of a cost (N,) of state and input."""
+        return -self.error_weight * self.control_scale * cost
+
+    @cached_property
+    def control_scale(self) -> float:
+        """Factor of a cost of state and input."""
+        factor = self.options.reward_scale
+        return 1.0 if factor is None else float(factor)
 
     def _error_cost(self, error: Array, covariance: Array) -> Array:
         if self.error == "squared":

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs, take_runs, value_of
 from fusion_gym.core.access import discrepancy, place_of
+from fusion_gym.core.control import control_of, inputs_of, over_of
 from fusion_gym.core.estimator import Reception
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.core.memory import Beliefs, Estimate, Memory
@@ -42,6 +43,9 @@ class Outcome(NamedTuple):
         diverged: (N,) bool, whether a squared error is not finite or exceeds the task's
             ``divergence_level``.
         ended: (N,) bool, whether the episode is over.
+        control_cost: Cost of state and input (N,), with a controller.
+        control: Input (k, N) that acts until the next sensing, with a controller.
+        terminated: (N,) bool, whether the controller ends the episode, for one that may.
     """
 
     reward: Array
@@ -55,10 +59,13 @@ class Outcome(NamedTuple):
     squared_error: Array
     diverged: NDArray[np.bool_]
     ended: NDArray[np.bool_]
+    control_cost: Array | None = None
+    control: Array | None = None
+    terminated: NDArray[np.bool_] | None = None
 
     def single(self, run: int) -> Outcome:
         """Return the outcome of one run, without the batch axis."""
-        return Outcome._make(part.T[run].copy() for part in self)
+        return Outcome._make(None if part is None else part.T[run].copy() for part in self)
 
 
 class State(NamedTuple):
@@ -70,17 +77,19 @@ class State(NamedTuple):
         network: The network's state before the requests.
         supposed: The estimator's state by the packets that the sensors suppose to have arrived;
             ``None`` if they know.
-        history: For late packets, the estimator's state before the update, the measurements and the
-            arrivals (sensors, N) of the last steps, oldest first.
+        history: For late packets, the estimator's state before the update, the measurements, the
+            arrivals (sensors, N) and the input of the last steps, oldest first.
         known: States (n, N) whose truth is known, for the error; ``None`` is all.
+        control: The last input (k, N), with a controller.
     """
 
     plant: Any
     estimate: Any
     network: NetworkState
     supposed: Any = None
-    history: tuple[tuple[Any, Array, NDArray[np.bool_]], ...] = ()
+    history: tuple[tuple[Any, Array, NDArray[np.bool_], Array | None], ...] = ()
     known: NDArray[np.bool_] | None = None
+    control: Array | None = None
 
 
 class Position(NamedTuple):
@@ -156,18 +165,48 @@ class Runs:
         self.memory.update(self.beliefs, delivery.known)
         self._delivered = after
         estimator, estimate, spent = task.estimator, after.estimate, delivery.spent
-        error = task.plant.truth(state.plant) - estimator.mean(estimate)
+        truth = task.plant.truth(state.plant)
+        error, over = truth - estimator.mean(estimate), over_of(task, truth)
         if state.known is not None:
             error = np.where(state.known, error, 0.0)
+        if over is not None:  # a run that ended before has no errors
+            error = np.where(over & (self.steps >= self.limit), 0.0, error)
         covariance, square = estimator.covariance(estimate), error * error
         error_term, token_term = task.reward.terms(error, covariance, spent, self.price)
         arrived, late = delivery.reception.arrived, task.network.late(network)
         arrived = arrived if late is None else arrived | late.any(0)
         diverged = namespace(square).logical_not(square <= task.divergence_level).any(0)
         self.steps = self.steps + 1
+        error_term, cost = self._close_loop(error_term, truth, after.control, over)
         flags, total = (requested, delivery.granted, arrived), error_term + token_term
-        ended = self.steps >= self.limit
-        return Outcome(total, error_term, token_term, spent, *flags, error, square, diverged, ended)
+        terms = total, error_term, token_term, spent
+        last: Any = diverged, self.steps >= self.limit, cost, after.control, over
+        return Outcome(*terms, *flags, error, square, *last)
+
+    def _close_loop(
+        self, error_term: Array, truth: Array, control: Array | None, over: Any
+    ) -> tuple[Array, Array | None]:
+        """Return the error term (N,) and the cost of state and input; an end charges what is left.
+
+        Args:
+            error_term: Error term (N,) of the estimation.
+            truth: The plant's state (n, N).
+            control: Input (k, N), with a controller.
+            over: Runs (N,) that the controller ends.
+        """
+        controller, task, last = self.task.controller, self.task, self.steps >= self.limit
+        if controller is None or control is None:
+            return error_term, None
+        cost, end = controller.cost(truth, control), controller.terminal_cost(truth)
+        if end is not None:
+            cost = cost + namespace(cost).where(last, end, 0.0)
+        if over is not None:
+            left = np.where(over, np.maximum(1 + self.limit - self.steps, 0), 1)
+            self.limit = np.where(over, np.minimum(self.limit, self.steps), self.limit)
+            error_term, cost = (np.where(left, left * each, 0.0) for each in (error_term, cost))
+        if task.objective == "control":
+            error_term = task.reward.control_term(cost)
+        return error_term, cost
 
     def answer(
         self, requests: NDArray[Any], runs: NDArray[np.int64] | slice = slice(None)
@@ -182,7 +221,7 @@ class Runs:
             noise: Standard normals (channels, N).
         """
         state = advance(self.task, settle(self.task, self.delivered), noise, self.steps)
-        self.memory.observe(self.task.plant.measurement(state.plant))
+        self.memory.observe(self.task.plant.measurement(state.plant), state.control)
         self.state = state
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
@@ -193,8 +232,8 @@ class Runs:
     def branch_memory(self, runs: NDArray[np.int64]) -> Branch:
         """Return independent runs of a scheduler whose x* is known.
 
-        The scheduler's memory does not depend on transmissions, so x* after a step is the original
-        runs' x*, an argument of :meth:`Branch.step`.
+        The scheduler's memory does not depend on transmissions without a controller, so x* after a
+        step is the original runs' x*, an argument of :meth:`Branch.step`.
 
         Args:
             runs: Numbers of the runs.
@@ -271,9 +310,9 @@ class Runs:
         (sensors, N), which pays for each sensor's packets, ``token_cost`` (sensors, 1),
         ``price`` (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor
         granted least recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N)
-        bool, ``observation`` (N, entries), ``estimate`` (the estimator's state), and the channels
-        and beliefs of :mod:`fusion_gym.core.knowledge`. Policies of single sensors read what these
-        suppose.
+        bool, ``observation`` (N, entries), ``estimate`` (the estimator's state), with a controller
+        its last input ``control`` (k, N), and the channels and beliefs of
+        :mod:`fusion_gym.core.knowledge`. Policies of single sensors read what these suppose.
         """
         nodes = None if self.state.supposed is None else self._signals(local=True)
         return self._signals(nodes=nodes)
@@ -296,6 +335,7 @@ class Runs:
             "observation": functools.partial(self.observe, local),
             "estimate": self.state.estimate,
         }
+        values |= {} if self.state.control is None else {"control": self.state.control}
         values |= self.memory.signals(self.beliefs)
         return Signals(values, self.task.hidden_signals, self.memory.missing_signals, nodes)
 
@@ -340,7 +380,8 @@ def start_of(task: Task, noise: Array) -> tuple[State, Any]:
     plant, announcement = task.plant.start(noise[:own])
     estimate = task.estimator.start(task.plant.measurement(plant), announcement)
     supposed = None if task.network.acknowledgement == 1.0 else estimate
-    return State(plant, estimate, task.network.start(noise[own:]), supposed), announcement
+    state = State(plant, estimate, task.network.start(noise[own:]), supposed)
+    return state._replace(control=control_of(task, plant, estimate)), announcement
 
 
 def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) -> State:
@@ -352,18 +393,18 @@ def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) ->
         noise: Standard normals (channels, N).
         steps: Steps taken (N,).
     """
-    own = task.plant.noise_channels
-    plant = task.plant.sense(state.plant, noise[:own])
+    own, moving, filters = task.plant.noise_channels, inputs_of(state.control), task.estimator
+    plant = task.plant.sense(state.plant, noise[:own], *moving)
     estimate, supposed = (
         known
         if known is None
-        else task.estimator.observe(task.estimator.predict(known), task.plant.measurement(plant))
+        else filters.observe(filters.predict(known, *moving), task.plant.measurement(plant))
         for known in (state.estimate, state.supposed)
     )
     readings, known = task.plant.available(plant) or (None, None)
     network = task.network.advance(state.network, noise[own:], steps, readings)
     network = rank_requests(task, network, estimate if supposed is None else supposed)
-    return State(plant, estimate, network, supposed, state.history, known)
+    return State(plant, estimate, network, supposed, state.history, known, state.control)
 
 
 def rank_requests(task: Task, state: NetworkState, known: Any) -> NetworkState:
@@ -391,16 +432,17 @@ def receive(
         beliefs: Function that returns the beliefs before the transmission.
     """
     estimator, arrived, history = task.estimator, delivery.reception.arrived, state.history
-    if task.delayed:
-        last = state.estimate, task.plant.measurement(state.plant), arrived
-        history = (*history, last)[1 - len(task.network.delay) :]
     estimate, supposed = estimator.update(state.estimate, delivery.reception), state.supposed
     if delivery.supposed is not None:
         supposed = estimator.update(supposed, Reception(delivery.supposed))
     if task.options.packet == "estimate":
         best, spread = beliefs().best
         estimate = estimator.adopt(estimate, best[0], spread[0], np.asarray(arrived.any(0)))
-    return State(state.plant, estimate, network, supposed, history, state.known)
+    control = control_of(task, state.plant, estimate)
+    if task.delayed:
+        last = state.estimate, task.plant.measurement(state.plant), arrived, control
+        history = (*history, last)[1 - len(task.network.delay) :]
+    return State(state.plant, estimate, network, supposed, history, state.known, control)
 
 
 def settle(task: Task, state: State) -> State:
@@ -419,14 +461,16 @@ def settle(task: Task, state: State) -> State:
         runs = np.flatnonzero(every & (oldest == back))
         if not runs.size:
             continue
-        parts, estimate = take_runs(state.history[-back:], runs), None
+        parts, estimate, acted = take_runs(state.history[-back:], runs), None, None
         history = []
-        for steps, (before, measurement, arrived) in zip(range(back, 0, -1), parts, strict=True):
+        for steps, part in zip(range(back, 0, -1), parts, strict=True):
+            before, measurement, arrived, control = part
             if estimate is not None:
-                before = estimator.observe(estimator.predict(estimate), measurement)
+                moved = estimator.predict(estimate, *inputs_of(acted))
+                before = estimator.observe(moved, measurement)
             arrived = arrived | late[steps - 1][:, runs]
-            estimate = estimator.update(before, Reception(arrived))
-            history.append((before, measurement, arrived))
+            estimate, acted = estimator.update(before, Reception(arrived)), control
+            history.append((before, measurement, arrived, control))
         settled = merge_runs(state.history[-back:], tuple(history), runs)
         state = state._replace(
             estimate=merge_runs(state.estimate, estimate, runs),

@@ -109,7 +109,9 @@ def sustained_tokens(task: Task) -> float:
 def nominal_error(task: Task) -> tuple[Array, float]:
     """Return each state's mean squared error (n,) with requests at an even pace, and its cost."""
     rate, sensors, weights = nominal_rate(task.network), task.sensors, task.reward.state_weights
-    separate = weights.ndim == 2
+    steered, separate = task.objective == "control", False
+    if not steered:
+        separate = weights.ndim == 2
     if rate == 0.0 and separate:
         return task.open_loop[:, 0], float(weights[:, 0] @ task.open_loop[:, 0])
     batch, cost = _batch(task, _RUNS, 1), 0.0
@@ -121,7 +123,10 @@ def nominal_error(task: Task) -> tuple[Array, float]:
         due -= requests
         outcome = batch.step(requests)
         total += outcome.squared_error.mean(-1)
-        cost += float(linalg.weighted_square(outcome.error, weights).mean())
+        each: Any = outcome.control_cost
+        if not steered:
+            each = linalg.weighted_square(outcome.error, weights)
+        cost += float(np.mean(each))
     error, steps = total / batch.task.horizon, batch.task.horizon
     return error, float(weights[:, 0] @ error) if separate else cost / steps
 

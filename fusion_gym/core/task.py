@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Self
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import declaration, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.action import ACTIONS, Action, ActionOptions, Sets, Single
+from fusion_gym.core.control import Controller
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.knowledge import (
     INFORMATION_MODES,
@@ -27,7 +29,7 @@ from fusion_gym.core.plant import Nature, Plant, TruthOptions, admit
 from fusion_gym.core.reward import Reward, RewardOptions, reward_weights
 from fusion_gym.declaration import NumpyOnly, OptionGroup, marked, plain_options
 from fusion_gym.entries import Arguments, Options
-from fusion_gym.errors import forbidden, refusal
+from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.fusion.table import Structure
 
 Broadcast = Literal["none", "estimate", "packets"]
@@ -128,6 +130,8 @@ class Scenario:
         required_policy: The policy whose silence the filter reads, or ``None``.
         noise: Source of the plant's noise; ``None`` draws standard normals.
         error: Function of errors and covariances in place of the option ``error``.
+        controller: Controller that closes the loop; its ``error_weights`` go before
+            ``state_weights``.
 
     Example:
         >>> import fusion_gym
@@ -150,6 +154,7 @@ class Scenario:
     required_policy: str | None = None
     noise: NoiseSource | None = None
     error: Callable[[Array, Array], Any] | None = None
+    controller: Controller | None = None
 
 
 # Additional signals that need the sensors' measurements.
@@ -212,10 +217,14 @@ class Task(Scenario):
             if not isinstance(part, kind):
                 allowed = f"an instance of {kind.__module__}.{kind.__name__}"
                 raise refusal(name, part, allowed)
+        usual, controller = scenario.state_weights, scenario.controller
+        if controller is not None:
+            _check_inputs(plant.sense, estimator.predict)
+            usual = usual if controller.error_weights is None else controller.error_weights
         if plant.nature != (nature := Nature.create(options)):
             nature.refuse("here", f"the truth of {type(plant).__name__} is its model")
         horizon = validation.horizon(options.horizon)
-        weights = reward_weights(options, scenario.state_weights, admit(plant, horizon))
+        weights = reward_weights(options, usual, admit(plant, horizon))
         memory = scenario.memory_estimator
         if options.memory_filter is not None and options.memory and memory is None:
             allowed = "None here, because this system has one filter"
@@ -261,6 +270,17 @@ class Task(Scenario):
         """Steps of an episode."""
         horizon = self.options.horizon
         return horizon if self.limit is None else min(horizon, self.limit)
+
+    @functools.cached_property
+    def objective(self) -> str:
+        """Meaning of the reward's error term: ``"estimation"`` or ``"control"``."""
+        return self.options.objective or ("control" if self.controller else "estimation")
+
+    @property
+    def steers(self) -> bool:
+        """Whether only simulations show what a packet is worth to the objective."""
+        controller: Any = self.controller
+        return self.objective == "control" and controller.error_weights is None
 
     @property
     def broadcast(self) -> str:
@@ -336,6 +356,11 @@ class Task(Scenario):
         if self.delayed:
             raise forbidden("delay", self.options.delay, reason, where)
 
+    def refuse_control(self, where: str) -> None:
+        """Raise an error with the place if a controller closes the loop."""
+        if self.controller is not None:
+            raise ConfigurationError(f"a controller is not allowed {where}: it solves estimation")
+
     def refuse_numpy_only(self) -> None:
         """Refuse what NumPy alone runs: marked options, parts, and functions of the error.
 
@@ -349,12 +374,21 @@ class Task(Scenario):
             default = plain_options(getattr(kind, name))
             if value in mark.values if mark.values else value != default:
                 raise refusal(name, value, "another value", "under JAX")
-        for name, part in (("plant", self.plant), ("estimator", self.estimator)):
-            if not part.traceable:
+        every: Any = {name: getattr(self, name) for name in ("plant", "estimator", "controller")}
+        for name, part in every.items():
+            if part is not None and not part.traceable:
                 allowed = "one that JAX traces (traceable = True)"
                 raise refusal(name, type(part).__name__, allowed, "under JAX")
         if callable(self.reward.error):
             raise refusal("error", self.reward.error_kind, "a kind", "under JAX")
+
+
+def _check_inputs(*methods: Callable[..., Any]) -> None:
+    """Refuse a controller with methods that take no input."""
+    for method in methods:
+        if "control" not in inspect.signature(method).parameters:
+            reason = f"{method.__qualname__} must take a further argument 'control'"
+            raise ConfigurationError(f"a controller is not allowed here: {reason}")
 
 
 def _unacknowledged(task: Task) -> bool:
@@ -424,5 +458,15 @@ EXCLUSIONS: tuple[tuple[str, Callable[[Task], Any], str, str], ...] = (
      and (not task.estimator.independent_nodes or task.estimator.reads_silence), "here",
      "it must be 'perfect', because a sensor's innovation needs the packets of all sensors that "
      "arrived"),
+    ("acknowledgements", lambda task: _unacknowledged(task) and task.controller, "here",
+     "it must be 'perfect', because the input, which is broadcast, acknowledges what arrives"),
+    ("objective", lambda task: task.objective == "control" and not task.controller, "here",
+     "it must be 'estimation', because there is no controller"),
+    ("error", lambda task: task.objective == "control" and task.reward.error != "squared",
+     "with objective='control'", "it must be 'squared', because the controller has the cost"),
+    ("terminal_weight",
+     lambda task: getattr(task.options, "terminal_weight", None) is not None
+     and not task.options.clock, "here",
+     "it needs clock=True, because an agent values the steps beyond a truncated episode"),
 )
 # fmt: on

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,8 @@ class Film:
     """The last steps of N runs of a task, and a picture of each run.
 
     A picture shows up to four states with the fused estimate and two claimed standard deviations,
-    one row of requests per sensor (granted or denied), and the tokens if they are limited. The
-    censored range of a state is shaded.
+    one row of requests per sensor (granted or denied), the input of a controller, and the tokens
+    if they are limited. The censored range of a state is shaded.
 
     Args:
         task: The task.
@@ -112,6 +112,10 @@ class Film:
         for mark, drawn in zip(self._marks, (granted, ~granted), strict=True):
             places, sensors = np.nonzero(requested & drawn)
             mark.set_data(times[places], sensors)
+        for place, line in enumerate(self._inputs):
+            line.set_data(times, [cast(Array, s.outcome.control)[place, run] for s in steps])
+            line.axes.relim()
+            line.axes.autoscale_view(scalex=False)
         if self._level is not None:
             self._level.set_data(times, [step.tokens[run] for step in steps])
         self._axes[-1].set_xlim(first, first + self._window + 1)
@@ -143,9 +147,9 @@ class Film:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        ratios = [_STATE] * len(self._state_names) + [_STRIP] * (
-            2 - self.task.network.bucket.unlimited
-        )
+        controller, states = self.task.controller, len(self.task.plant.state_names)
+        strips = 2 - self.task.network.bucket.unlimited + (controller is not None)
+        ratios = [_STATE] * len(self._state_names) + [_STRIP] * strips
         height = _TOP + _BOTTOM + sum(ratios)
         self._figure = Figure(figsize=(_WIDTH / 100, height / 100), dpi=100)
         self._canvas = FigureCanvasAgg(self._figure)
@@ -180,6 +184,11 @@ class Film:
         requests.set_ylim(sensors - 0.4, -0.6)
         requests.set_yticks(range(sensors) if sensors <= 6 else [0, sensors - 1])
         requests.set_ylabel("sensor")
+        self._inputs: list[Any] = []
+        if controller is not None:
+            axis, still = self._axes[len(self._state_names) + 1], np.zeros((states, 1))
+            axis.set_ylabel("input")
+            self._inputs = [axis.plot([], [], lw=1.2)[0] for _ in controller.act(still)]
         self._level: Any = None
         if not bucket.unlimited:
             (self._level,) = self._axes[-1].plot([], [], color=_TOKENS, lw=1.6)

@@ -14,7 +14,7 @@ from pettingzoo import ParallelEnv
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.envs.vector import refuse_vector_reward
+from fusion_gym.envs.vector import ends_of, refuse_vector_reward
 from fusion_gym.envs.views import SensorView
 from fusion_gym.errors import display
 
@@ -111,7 +111,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
             )
         selection = [actions[agent] for agent in self.agents]
         outcome = self.batch.step(self.view.action.requests(selection, None))
-        reward, ended = float(outcome.reward[0]), bool(outcome.ended[0])
+        reward, (terminated, truncated) = float(outcome.reward[0]), ends_of(self.task, outcome)
         agents = self.agents
         costs = outcome.granted[:, 0] * self.task.network.bucket.cost[:, 0]
         infos = {
@@ -121,11 +121,11 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         result = (
             self._observations(),
             dict.fromkeys(agents, reward),
-            dict.fromkeys(agents, ended and self.task.options.clock),
-            dict.fromkeys(agents, ended and not self.task.options.clock),
+            dict.fromkeys(agents, bool(terminated[0])),
+            dict.fromkeys(agents, bool(truncated[0])),
             infos,
         )
-        if ended:
+        if outcome.ended[0]:
             self.agents = []
         return result
 

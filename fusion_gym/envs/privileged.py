@@ -30,12 +30,14 @@ class Alternatives(NamedTuple):
 
     Attributes:
         error: Truth minus fused estimate (n, A, N).
+        reward_error: Error term of the reward (A, N).
         communication: Token term of the reward (A, N).
         observation: (A, N, entries) float32 of the next state, which for an ended episode is the
             state without a reset.
     """
 
     error: Array
+    reward_error: Array
     communication: Array
     observation: NDArray[np.float32]
 
@@ -68,6 +70,7 @@ def alternatives(
     if each.dtype != np.bool_:  # channels, which the outcome does not have
         granted, base, other = granted * each, before.task.network.slots + 1, np.arange(values.size)
     error, communication = taken.error, taken.reward_communication
+    reward = taken.reward_error
     if other.size:
         first = place = np.arange(other.size)
         if sensors * (base - 1).bit_length() + runs.bit_length() <= _MOST_BITS:
@@ -76,17 +79,19 @@ def alternatives(
         values[other] = runs + place
         places = other[first]
         run, sent = places % runs, granted[:, places]
-        if before.memory.keeps_every:
+        if before.memory.keeps_every and before.task.controller is None:
             branch = before.branch_memory(run)
             outcome = branch.step(sent, noise[:, run], take_runs(beliefs.best, run))
         else:
             branch = before.branch(run)
             outcome = branch.step(sent, noise[:, run])
         error = np.concatenate((error, outcome.error), axis=-1)
+        reward = np.concatenate((reward, outcome.reward_error))
         communication = np.concatenate((communication, outcome.reward_communication))
         observation = np.concatenate((observation, branch.observe(local)))
     return Alternatives(
         error[:, values].reshape(-1, many, runs),
+        reward[values].reshape(many, runs),
         communication[values].reshape(many, runs),
         observation[values].reshape(many, runs, -1),
     )
@@ -113,7 +118,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         num_envs: Number N of runs.
         error: Error term of the rewards: ``"squared"`` is the task's own, ``"excess"`` and
             ``"mismatch"`` are defined in :meth:`~fusion_gym.core.reward.Reward.training_error`. The
-            returns in infos are the task's.
+            returns in infos are the task's. With ``objective="control"`` and a controller with
+            error weights all are of the weighted error.
         reference: Estimator of every measurement
             (:func:`reference_estimator`), needed unless ``error`` is ``"squared"``.
         **options: Keyword arguments of :class:`~fusion_gym.envs.sb3.FusionSB3VecEnv`.
@@ -139,6 +145,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         if error != "squared" and task.reward.error != "squared":
             allowed = f"'squared' with the task's error={task.reward.error_kind!r}"
             raise refusal("error", error, allowed)
+        if error != "squared" and task.steers:
+            raise refusal("error", error, "'squared' with a controller without error weights")
         super().__init__(task, num_envs, **options)
         if error != "squared":
             self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)
@@ -181,12 +189,13 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         self._observed = self.view.rows(observation)
         beliefs, local = self.batch.beliefs(), self.view.local
         result = alternatives(before, self._requests, noise, outcome, observation, beliefs, local)
-        reward = self._error_term(result.error) + result.communication
+        term = result.reward_error if self.task.steers else self._error_term(result.error)
+        reward = term + result.communication
         self._branched = Branched(reward * scale, result.observation)
         return outcome
 
     def _reward(self, outcome: Outcome) -> Array:
-        if self.error == "squared":
+        if self.error == "squared" and (self.task.steers or self.task.objective != "control"):
             return outcome.reward
         return self._error_term(outcome.error[:, None])[0] + outcome.reward_communication
 

@@ -15,7 +15,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.entries import State
-from fusion_gym.envs.vector import Infos, refuse_vector_reward
+from fusion_gym.envs.vector import Infos, ends_of, refuse_vector_reward
 from fusion_gym.envs.views import make_view
 
 
@@ -130,10 +130,10 @@ class FusionSB3VecEnv(VecEnv):
         self.totals = (self.totals[0] + float(outcome.cost.sum()), self.totals[1] + self.runs)
         request_count, granted = np.count_nonzero(requests), np.count_nonzero(outcome.granted)
         self.requests = (self.requests[0] + int(request_count), self.requests[1] + int(granted))
-        done = outcome.ended
+        done, terminated = outcome.ended, ends_of(self.task, outcome)[0]
         infos: list[Infos] = [{} for _ in range(self.num_envs)]
         if done.any():
-            self._finish(np.flatnonzero(done), lengths, infos)
+            self._finish(np.flatnonzero(done), lengths, terminated, infos)
         reward = (self._reward(outcome) * scale).astype(np.float32)
         result = (self._observe(), reward.repeat(self._rows), done.repeat(self._rows), infos)
         self.seconds += time.perf_counter() - began
@@ -156,7 +156,11 @@ class FusionSB3VecEnv(VecEnv):
         self.totals = snapshot["totals"]
 
     def _finish(
-        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[Infos]
+        self,
+        runs: NDArray[np.int64],
+        lengths: NDArray[np.int64],
+        terminated: NDArray[np.bool_],
+        infos: list[Infos],
     ) -> None:
         """Write the infos of finished runs and begin their next episodes."""
         final = self._observe()
@@ -165,7 +169,7 @@ class FusionSB3VecEnv(VecEnv):
             for row in range(run * self._rows, (run + 1) * self._rows):
                 infos[row] = {
                     "terminal_observation": final[row],
-                    "TimeLimit.truncated": not self.task.options.clock,
+                    "TimeLimit.truncated": not terminated[run],
                     "episode": {
                         "r": float(self._returns[run]),
                         "l": int(lengths[run]) + 1,

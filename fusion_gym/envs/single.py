@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import validation
+from fusion_gym.arrays import map_arrays
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments
 from fusion_gym.envs import vector
@@ -115,15 +115,16 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
         outcome = self.batch.step(self.view.action.requests(action, None), 0)
         if self._film is not None:
-            self._film.record(self.batch, Outcome._make(part[..., None].copy() for part in outcome))
+            whole = map_arrays(lambda part: part[..., None].copy(), outcome)
+            self._film.record(self.batch, whole)
             self._show()
         observation = self.batch.observe()[0]
         infos = vector.step_infos(outcome)
-        ended, clock = bool(outcome.ended), self.task.options.clock
+        terminated, truncated = vector.ends_of(self.task, outcome)
         reward: Any = vector.rewards_of(self.task, outcome)
         if self.task.options.reward != "vector":
             reward = float(reward)
-        return observation, reward, ended and clock, ended and not clock, infos
+        return observation, reward, bool(terminated), bool(truncated), infos
 
     def render(self) -> Frame | None:
         """Return the picture (height, width, 3) of the present step with ``"rgb_array"``."""

@@ -214,8 +214,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
             final = _final_infos(infos, ended, batch.observe())
             self._begin(np.flatnonzero(ended))
             infos = _cleared(infos, ended)
-        never = np.zeros_like(ended)
-        terminated, truncated = (ended, never) if self.task.options.clock else (never, ended)
+        terminated, truncated = ends_of(self.task, outcome._replace(ended=ended))
         infos = _with_mask(infos, self._everyone) | final
         return batch.observe(), reward, terminated, truncated, infos
 
@@ -264,6 +263,16 @@ def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MOD
     return None if render_mode is None else str(render_mode)
 
 
+def ends_of(task: Task, outcome: Outcome) -> tuple[Any, Any]:
+    """Return ``terminated`` and ``truncated`` of an outcome.
+
+    The plant may terminate an episode, and its last step does if the observation has the clock.
+    """
+    ended, over = outcome.ended, outcome.terminated
+    terminated = ended & (task.options.clock if over is None else over | task.options.clock)
+    return terminated, ended & ~terminated
+
+
 def rewards_of(task: Task, outcome: Outcome) -> NDArray[np.float64]:
     """Return the rewards (N,) of a step, or (N, 2) with error term and token term."""
     if task.options.reward != "vector":
@@ -288,6 +297,7 @@ def step_infos(outcome: Outcome) -> Infos:
     TorchRL reads the ``dtype`` of every value. The flag of one run is an array of shape (), because
     Gymnasium's vector environments turn NumPy's scalar flags into objects.
     """
+    loop = {"control_cost": outcome.control_cost, "control": outcome.control}
     return {
         "cost": outcome.cost,
         "cost_tokens": outcome.cost,
@@ -298,7 +308,7 @@ def step_infos(outcome: Outcome) -> Infos:
         "denied": (outcome.requested > outcome.granted).T,
         "squared_error": outcome.squared_error.T,
         "diverged": outcome.diverged[...],
-    }
+    } | {key: value.T for key, value in loop.items() if value is not None}
 
 
 def reset_outcome(task: Task, num_envs: int) -> Outcome:
@@ -306,7 +316,10 @@ def reset_outcome(task: Task, num_envs: int) -> Outcome:
     none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
     silence = np.zeros((task.sensors, num_envs), dtype=np.bool_)
     error = np.zeros((len(task.plant.state_names), num_envs))
-    return Outcome(none, none, none, none, silence, silence, silence, error, error, never, never)
+    terms = none, none, none, none, silence, silence, silence, error, error, never, never
+    if task.controller is None:
+        return Outcome(*terms)
+    return Outcome(*terms, none, 0.0 * task.controller.act(error))
 
 
 def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,9 @@ class EpisodeResults:
         diverged: share of diverged steps (E,).
         squared_error: squared error (H, n) at each time and state, averaged over the episodes that
             are not lost by then.
+        control_cost: cost of state and input (E,), with a controller; a step that the plant ends
+            is charged for each forfeited step, whose errors count as zero.
+        control: squared input (E, k), with a controller.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
@@ -68,6 +71,8 @@ class EpisodeResults:
     returns: Array
     diverged: Array
     squared_error: Array
+    control_cost: Array | None = None
+    control: Array | None = None
 
     @property
     def episodes(self) -> int:
@@ -176,7 +181,7 @@ def _joined(parts: Sequence[EpisodeResults]) -> EpisodeResults:
     joined = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in fields(EpisodeResults)
-        if field.name != "squared_error"
+        if field.name != "squared_error" and getattr(parts[0], field.name) is not None
     }
     error = sum(w * part.squared_error for w, part in zip(weights, parts, strict=True))
     return EpisodeResults(**joined, squared_error=np.asarray(error))
@@ -217,6 +222,10 @@ _MEANS: dict[str, Callable[[_Step], NDArray[Any]]] = {
     "denied": lambda step: (step.outcome.requested & ~step.outcome.granted).sum(0),
     "diverged": lambda step: step.outcome.diverged,
 }
+_OF_CONTROL: dict[str, Callable[[_Step], NDArray[Any]]] = {
+    "control_cost": lambda step: cast(Array, step.outcome.control_cost),
+    "control": lambda step: cast(Array, step.outcome.control) ** 2,
+}
 
 
 def _results(
@@ -225,7 +234,8 @@ def _results(
     """Run an episode of all runs of a batch, and return the results of its equal parts."""
     task, runs = batch.task, batch.num_envs
     horizon, sensors, episodes = task.horizon, task.sensors, runs // parts
-    means = {name: np.zeros(runs) for name in _MEANS}
+    functions = _MEANS if task.controller is None else _MEANS | _OF_CONTROL
+    means: dict[str, Any] = dict.fromkeys(functions, 0.0)
     rate, requests = np.zeros((sensors, runs)), np.zeros((sensors, runs))
     returns, squared_error = np.zeros(runs), []
     batch.nonfinite = lost = np.zeros(runs, dtype=np.bool_)
@@ -235,14 +245,14 @@ def _results(
         errors = np.where(lost, 0.0, outcome.squared_error).reshape(-1, parts, episodes).sum(-1)
         finite = (~lost).reshape(parts, episodes).sum(-1)
         squared_error.append(np.where(finite > 0, errors / np.maximum(finite, 1), np.nan))
-        for name, mean in _MEANS.items():
-            means[name] += mean(_Step(batch, outcome, covariance))
+        for name, mean in functions.items():
+            means[name] = means[name] + mean(_Step(batch, outcome, covariance))
         rate += outcome.granted
         requests += outcome.requested
         returns += outcome.reward
         if progress is not None:
             progress(runs)
-    values = {name: total / horizon for name, total in means.items()}
+    values = {name: total.T / horizon for name, total in means.items()}
     values |= {"rate": (rate / horizon).T, "requests": (requests / horizon).T, "returns": returns}
     for value in values.values():
         value[lost] = np.nan
@@ -268,6 +278,7 @@ class Trajectory:
         tokens: tokens after each step (H,).
         requested: requests (H, sensors), bool.
         granted: grants (H, sensors), bool.
+        control: input (H, k) after each step, with a controller.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
@@ -284,6 +295,7 @@ class Trajectory:
     tokens: Array
     requested: NDArray[np.bool_]
     granted: NDArray[np.bool_]
+    control: Array | None = None
 
 
 def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
@@ -318,7 +330,8 @@ def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
         variance = linalg.diagonal(estimator.covariance(estimate))
         means = estimator.mean(estimate), variance, estimator.local_means(estimate)
         network = batch.tokens, outcome.requested, outcome.granted
-        values = task.plant.truth(plant), *means, *network
+        loop = () if outcome.control is None else (outcome.control,)
+        values = task.plant.truth(plant), *means, *network, *loop
         rows.append([np.array(value[..., 0]) for value in values])
     return Trajectory(*map(np.array, zip(*rows, strict=True)))
 

@@ -102,15 +102,17 @@ class Metric(NamedTuple):
         interval: whether printed tables show the half width of its interval.
         samples: function from results to samples (E,) or (E, axis); the field of
             :class:`EpisodeResults` with the name of the metric by default.
+        loop: whether only a closed loop has it.
     """
 
     meaning: str
     better: Literal["lower", "higher", "1", ""] = ""
-    axis: Literal["", "sensor", "state"] = ""
+    axis: Literal["", "sensor", "state", "input"] = ""
     column: str = ""
     form: str = ".3f"
     interval: bool = False
     samples: Callable[[EpisodeResults], Array] | None = None
+    loop: bool = False
 
     def summary(self, name: str, results: EpisodeResults) -> Any:
         """Return the metric's interval, or its means along its axis."""
@@ -139,6 +141,11 @@ METRICS = {
         "sum of the rewards of an episode", "higher", column="return", form=".4g", interval=True,
         samples=lambda results: results.returns,
     ),
+    "control_cost": Metric(
+        "cost of state and input, per step",
+        "lower", column="control", form=".4g", interval=True, loop=True,
+    ),
+    "control": Metric("squared input per step", axis="input", loop=True),
 }  # fmt: skip
 
 
@@ -149,8 +156,8 @@ def summarise(results: EpisodeResults) -> Plain:
         results: results of the policy.
 
     Returns:
-        By metric a table ``{"mean", "low", "high"}``, or a list with one number per sensor or
-        state.
+        By metric a table ``{"mean", "low", "high"}``, or a list with one number per sensor, state
+        or input.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
@@ -160,7 +167,11 @@ def summarise(results: EpisodeResults) -> Plain:
         >>> summarise(results)["rate"]
         [0.15, 0.15, 0.1]
     """
-    return {name: metric.summary(name, results) for name, metric in METRICS.items()}
+    return {
+        name: metric.summary(name, results)
+        for name, metric in METRICS.items()
+        if not metric.loop or getattr(results, name) is not None
+    }
 
 
 def metric_table(_: str) -> str:

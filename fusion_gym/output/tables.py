@@ -56,7 +56,8 @@ def evaluation_table(
     differences: Mapping[str, Interval],
 ) -> Table:
     """Return the table of an evaluation, with one row per policy."""
-    metrics = {name: metric for name, metric in METRICS.items() if metric.column}
+    common = set(METRICS).intersection(*policies.values())
+    metrics = {name: item for name, item in METRICS.items() if item.column and name in common}
     columns = ["policy", *(metric.column for metric in metrics.values()), "median"]
     columns += ["MSE - reference"] if differences else []
     rows = []

@@ -12,6 +12,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import (
+    CONTROL_SIGNAL,
     KNOWLEDGE,
     MEMORY_SIGNALS,
     NETWORK_SIGNALS,
@@ -79,7 +80,8 @@ def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     knower = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # no declaration: all signals
     if not task.options.memory and covers(knower, "own"):
         knower = least_covering((knower, "own_memory"))  # beliefs use only the new measurements
-    every = (*task.estimator.signals, *MEMORY_SIGNALS, *NETWORK_SIGNALS, *PLANNING_SIGNALS)
+    common = (*MEMORY_SIGNALS, *NETWORK_SIGNALS, *PLANNING_SIGNALS, CONTROL_SIGNAL)
+    every = (*task.estimator.signals, *common)
     least = {signal.name: signal for signal in every}
     node: Knowledge = "own" if covers(task.knowledge, "own") else task.knowledge
     bucket = task.network.bucket

@@ -72,7 +72,8 @@ class Imagination:
         if task.network.channel is not None and task.network.channel.states > 1:
             known.channel = signals["channel_state"][..., runs].reshape(-1, len(runs))
         network = rank_requests(task, task.network.draw(known, rest_of_first), estimate)
-        state = State(plant, estimate, network)
+        control = signals["control"][:, runs] if task.controller else None
+        state = State(plant, estimate, network, control=control)
         limit = np.full_like(steps, task.horizon)
         position = Position(state, signals["price"][runs], steps, limit)
         branch = Branch(task, self._memory.with_states(states), self._layout, position)
@@ -98,7 +99,8 @@ class Rollout:
 
     The cost is error_weight · ‖x* - x̂‖² + ``price`` for each token, with the reward's weights and
     x* the best estimate at that step. If x* is the conditional mean, the cost is the expected
-    squared error minus a part that no decision changes.
+    squared error minus a part that no decision changes. Where a controller has no error weights, it
+    is the simulated cost of state and input instead.
 
     With infinite ``samples`` and ``steps`` and a true model, its cost is at most the base's cost.
     One step takes samples · (steps + 1) · (sensors + 1) steps of the base.
@@ -233,9 +235,12 @@ class Rollout:
         cost = np.zeros(len(lanes))
         for step in range(self.steps + 1):
             best = branch.beliefs().best.mean[0]
-            spent = branch.deliver(requests).cost
+            outcome = branch.deliver(requests)
             missed = best - self._task.estimator.mean(branch.delivered.estimate)
-            cost += linalg.weighted_square(missed, self._weights) + price * spent
+            error = linalg.weighted_square(missed, self._weights)
+            if self._task.steers:
+                error = -outcome.reward_error
+            cost += error + price * outcome.cost
             if step < self.steps:
                 branch.sense(noise[step].take(lanes, axis=-1))
                 requests = np.asarray(self._decision(branch.signals()))

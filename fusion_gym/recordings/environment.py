@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from fusion_gym.arrays import Array
 from fusion_gym.core.noise import PhiloxNoise
 from fusion_gym.core.task import Scenario
-from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.systems.bases import Truth
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.linear import LinearFusionOptions, build_linear
@@ -87,10 +87,10 @@ class RecordedPlant(CensoredPlant):
         state, mean = super().start(np.nan_to_num(noise[:-1]))
         return self._with_gaps(state, own), Announcement(mean, noise[-1])
 
-    def sense(self, state: Truth, noise: Array) -> Truth:
+    def sense(self, state: Truth, noise: Array, control: Array | None = None) -> Truth:
         """See :class:`Plant`."""
         own = noise[self.dynamics.noise_channels :]
-        return self._with_gaps(super().sense(state, np.nan_to_num(noise)), own)
+        return self._with_gaps(super().sense(state, np.nan_to_num(noise), control), own)
 
     def available(self, state: Truth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """See :class:`Plant`; lagged states have no truth of their own."""
@@ -209,6 +209,9 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     from fusion_gym.recordings import FittedPlant
     from fusion_gym.recordings.fitting import noisy_channels
 
+    if choice.input_matrix is not None:
+        reason = "what was recorded follows no other input"
+        raise forbidden("input_matrix", choice.input_matrix, reason, "with a recording")
     if choice.log is None:
         choice = _example(choice)
     if not isinstance(choice.log, str | os.PathLike):

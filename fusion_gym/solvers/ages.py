@@ -54,6 +54,7 @@ def age_sources(task: Task, longest: int = _LONGEST) -> tuple[AgeSource, ...]:
     model, network = task.plant, task.network
     if not isinstance(model, AgedSources):
         raise validation.refusal("sources", None, "vector sources", "for costs by age")
+    task.refuse_control("for costs by age")
     channel = network.channel or Channel(ChannelOptions(), task.sensors)
     weights = task.reward.error_weight * task.reward.separate_weights("here")[:, None]
     costs = model.age_costs(weights, longest + _BEYOND)

@@ -62,6 +62,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     if task.network.acknowledgement < 1.0:
         value, allowed = task.settings.get("acknowledgements"), "'perfect'"
         raise validation.refusal("acknowledgements", value, allowed, "for the optimum")
+    task.refuse_control("for the optimum")
     if reward.error != "squared":
         raise validation.refusal("error", reward.error_kind, "'squared'", "for the optimum")
     if reward.price.fixed is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,13 @@ def initial_law(mean: ArrayLike, covariance: ArrayLike, size: int) -> dict[str, 
         "initial_covariance": start,
         "initial_factor": linalg.root(start),
     }
+
+
+def steer(moved: Array, matrix: Array | None, control: Array | None) -> Array:
+    """Return states (…, n, N) with the effect B u of an input (k, N), if there is one."""
+    if control is None or matrix is None:
+        return moved
+    return moved + linalg.matvec(matrix, control)
 
 
 class Sensors(Scheduled):
@@ -117,14 +124,17 @@ class LinearDynamics(Scheduled):
 
 @dataclass(frozen=True)
 class LinearPlant(LinearDynamics):
-    """x(t+1) = A x(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
+    """x(t+1) = A x(t) + B u(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
 
-    With a ``schedule`` A and W depend on t.
+    With a ``schedule`` A and W depend on t. ``input_matrix`` is B (n, k, 1), and ``feedback`` B L
+    (n, n, 1) of a controller u = -L x̂, without which nothing moves but the noise.
 
     Source: tobit_token_bucket, equation (1).
     """
 
     schedule: MatrixSchedule | None = None
+    input_matrix: Array | None = None
+    feedback: Array | None = None
 
     @classmethod
     def create(
@@ -159,20 +169,30 @@ class LinearPlant(LinearDynamics):
         """Draw x(0) (n, N) with the mean ``mean`` (n, N) from standard normals (n, N)."""
         return mean + linalg.matvec(self.initial_factor, noise)
 
-    def advance(self, state: Array, noise: Array, departure: Array | None = None) -> Array:
+    def advance(
+        self,
+        state: Array,
+        noise: Array,
+        departure: Array | None = None,
+        control: Array | None = None,
+    ) -> Array:
         """Return x(t+1) (n, N).
 
         Args:
             state: x(t) (n, N).
             noise: standard normals (r, N).
             departure: (4, N), or None; with it the plant moves by I + c (A - I).
+            control: u (k, N), or None.
         """
         moved = true_motion(departure, state, linalg.matvec(self.transition, state))
+        moved = steer(moved, self.input_matrix, control)
         if not self.noise_channels:
             return moved
         return moved + linalg.matvec(self.process_factor, noise)
 
-    def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def predict(
+        self, mean: Array, covariance: Array, control: Array | None = None
+    ) -> tuple[Array, Array]:
         """Return the prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.
 
         Where A P Aᵀ cancels, as after a known start, it is (A F)(A F)ᵀ with a root F of P.
@@ -180,17 +200,19 @@ class LinearPlant(LinearDynamics):
         Args:
             mean: posterior mean (n, N).
             covariance: P (n, n, N).
+            control: u (k, N), or None.
 
         Source: tobit_token_bucket, equations (21) and (29).
         """
+        moved = steer(linalg.matvec(self.transition, mean), self.input_matrix, control)
         prior = linalg.congruence(self.transition, covariance) + self.process_covariance
         if not self._known_start:
-            return linalg.matvec(self.transition, mean), prior
+            return moved, prior
         most = linalg.total(self._cancelling * linalg.diagonal(covariance)[..., None, :, :])
         cancelled = linalg.diagonal(prior) < most
         parts = covariance, self.transition, self.process_covariance
         (prior,) = in_runs(cancelled, _predict_root, parts, (prior,))
-        return linalg.matvec(self.transition, mean), prior
+        return moved, prior
 
     @functools.cached_property
     def _known_start(self) -> bool:
@@ -207,10 +229,15 @@ class LinearPlant(LinearDynamics):
         return np.array([np.diagonal(moment) for moment in self.moments(horizon)][1:]).mean(0)
 
     def second_moments(self, horizon: int, random_start: bool = False) -> Array:
-        """Return the mean square (horizon + 1, n) of each state at t = 0..horizon."""
-        mean, size = self.initial_mean[:, 0], self.size
+        """Return the mean square (horizon + 1, n) of each state at t = 0..horizon.
+
+        A controller of this plant knows the state.
+        """
+        mean, size, loop = self.initial_mean[:, 0], self.size, self
         start = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
-        return np.array([np.diagonal(moment) for moment in self.moments(horizon, start)])
+        if self.feedback is not None:
+            loop = replace(self, transition=self.transition - self.feedback)
+        return np.array([np.diagonal(moment) for moment in loop.moments(horizon, start)])
 
     def moments(self, horizon: int, square: float | Array = 0.0) -> Iterator[Array]:
         """Yield the error's covariances (n, n) at t = 0..horizon.

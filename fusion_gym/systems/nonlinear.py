@@ -6,14 +6,17 @@ import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.control import Controller
 from fusion_gym.core.estimator import Reception, SignalValues
 from fusion_gym.core.knowledge import Block, age_block, common_signals, log_deviation, numbered
+from fusion_gym.errors import ConfigurationError
 from fusion_gym.systems import bases
 
 _RUNS = 1000  # that tell what happens without transmissions
@@ -41,6 +44,10 @@ class NonlinearSystem(ABC):
     observation and the simulated error without transmissions. All arrays have the batch axis N
     last.
 
+    With ``inputs`` a controller closes the loop: you also write :meth:`control` and :meth:`cost`,
+    and :meth:`move` and :meth:`predict` take the input as a last argument ``control`` (k, N). Pass
+    ``controller`` to the scenario beside ``plant`` and ``estimator``.
+
     Args:
         state_names: a name for each of the n states.
         sensors: number of sensors l.
@@ -48,6 +55,7 @@ class NonlinearSystem(ABC):
         process_channels: standard normals that :meth:`move` consumes.
         initial_mean: mean (n,) of the Gaussian initial state, of truth and filter.
         initial_covariance: covariance (n, n) of the initial state.
+        inputs: numbers k of a controller's input; 0 for no controller.
 
     Raises:
         ConfigurationError: a wrong shape, or a covariance that is not positive semi-definite.
@@ -80,6 +88,7 @@ class NonlinearSystem(ABC):
         process_channels: int,
         initial_mean: ArrayLike,
         initial_covariance: ArrayLike,
+        inputs: int = 0,
     ) -> None:
         self.state_names = tuple(state_names)
         size = len(self.state_names)
@@ -90,6 +99,7 @@ class NonlinearSystem(ABC):
         self.initial_covariance = validation.covariance(
             "initial_covariance", initial_covariance, size
         )
+        self.inputs = validation.integer("inputs", inputs, at_least=0)
 
     @abstractmethod
     def move(self, state: Array, noise: Array) -> Array:
@@ -131,6 +141,38 @@ class NonlinearSystem(ABC):
             measurement: its measurement (m, N).
         """
 
+    def control(self, mean: Array) -> Array:
+        """Return the input (k, N); only with ``inputs``.
+
+        Args:
+            mean: estimate (n, N).
+        """
+        raise NotImplementedError("a system with inputs must define 'control'")
+
+    def cost(self, state: Array, control: Array) -> Array:
+        """Return the cost (N,) >= 0 of a step; only with ``inputs``.
+
+        Args:
+            state: true state (n, N).
+            control: input (k, N).
+        """
+        raise NotImplementedError("a system with inputs must define 'cost'")
+
+    def terminated(self, state: Array) -> NDArray[np.bool_] | None:
+        """Return the runs (N,), bool, that end here, as a fall does; ``None`` is none.
+
+        The cost of that step is charged for each step that is left. Read only with ``inputs``.
+
+        Args:
+            state: true state (n, N).
+        """
+        return None
+
+    @functools.cached_property
+    def controller(self) -> NonlinearController | None:
+        """The controller, for a scenario; ``None`` without ``inputs``."""
+        return NonlinearController(self) if self.inputs else None
+
     @functools.cached_property
     def plant(self) -> NonlinearPlant:
         """The truth, for a scenario."""
@@ -159,18 +201,56 @@ class NonlinearSystem(ABC):
         return np.sqrt(np.maximum(moment, 1e-12)), np.maximum(error, 1e-12)
 
     def silence(self, horizon: int) -> tuple[Array, Array]:
-        """Mean second moment and squared error (n,) over t = 1..horizon without transmissions."""
+        """Mean second moment and squared error (n,) over t = 1..horizon without transmissions.
+
+        A controller of the second moment knows the state.
+        """
         generator, plant, filters = np.random.default_rng(_SEED), self.plant, self.estimator
         truth, _ = plant.start(generator.standard_normal((plant.start_channels, _RUNS)))
         state = filters.start(truth.measurement, None)
         nobody = Reception(np.zeros((self.sensors, _RUNS), dtype=np.bool_))
         moment = error = np.zeros(len(self.state_names))
+        controller, known = self.controller, truth
         for _ in range(horizon):
-            truth = plant.sense(truth, generator.standard_normal((plant.noise_channels, _RUNS)))
-            state = filters.update(filters.predict(state), nobody)
-            moment = moment + (truth.truth**2).mean(-1)
+            noise = generator.standard_normal((plant.noise_channels, _RUNS))
+            inputs = () if controller is None else (controller.act(state.mean),)
+            moving = inputs if controller is None else (controller.act(known.truth),)
+            known = plant.sense(known, noise, *moving)
+            truth = known if controller is None else plant.sense(truth, noise, *inputs)
+            state = filters.update(filters.predict(state, *inputs), nobody)
+            moment = moment + (known.truth**2).mean(-1)
             error = error + ((truth.truth - state.mean) ** 2).mean(-1)
         return moment / horizon, error / horizon
+
+
+class NonlinearController(Controller):
+    """The controller of a :class:`NonlinearSystem`."""
+
+    def __init__(self, system: NonlinearSystem) -> None:
+        self.system = system
+
+    def act(self, mean: Array) -> Array:
+        """Return the system's input."""
+        return _checked("control", self.system.control(mean), (self.system.inputs, mean.shape[-1]))
+
+    def cost(self, truth: Array, control: Array) -> Array:
+        """Return the system's cost."""
+        cost = _checked("cost", self.system.cost(truth, control), truth.shape[-1:])
+        if not np.all(cost >= 0.0):
+            raise ValueError(f"cost of {cost.min()} is not allowed: it must be >= 0")
+        return cost
+
+    def terminated(self, truth: Array) -> NDArray[np.bool_] | None:
+        """Return the runs that the system ends."""
+        return self.system.terminated(truth)
+
+
+def _checked(name: str, values: Array, shape: tuple[int, ...]) -> Array:
+    """Return what a user's method returned, of this shape."""
+    result = np.asarray(values, dtype=np.float64)
+    if result.shape != shape:
+        raise ValueError(f"{name} of shape {result.shape} is not allowed: it must be {shape}")
+    return result
 
 
 class NonlinearPlant(bases.NormalPlant):
@@ -202,11 +282,30 @@ class NonlinearPlant(bases.NormalPlant):
         time = np.zeros(noise.shape[-1])
         return bases.Truth(truth, system.measured(truth, noise[size:]), None, time), None
 
-    def sense(self, state: bases.Truth, noise: Array) -> bases.Truth:
-        """Move the plant, and measure."""
-        own = self.system.process_channels
-        truth = self.system.move(state.truth, noise[:own])
+    def sense(self, state: bases.Truth, noise: Array, *control: Array) -> bases.Truth:
+        """Move the plant, and measure; a run that has ended rests."""
+        own, over = self.system.process_channels, self._over(state)
+        if bool(control) != bool(self.system.inputs):
+            system = type(self.system).__name__
+            raise ConfigurationError(
+                f"inputs = {self.system.inputs} is not allowed here: a scenario of {system} needs "
+                "its controller"
+            )
+        truth = self.system.move(state.truth, noise[:own], *control)
+        truth = truth if over is None else np.where(over, state.truth, truth)
         return bases.Truth(truth, self.system.measured(truth, noise[own:]), None, state.time + 1.0)
+
+    def available(self, state: bases.Truth) -> tuple[NDArray[Any], NDArray[Any]] | None:
+        """See :class:`Plant`; a run that has ended has no readings."""
+        over = self._over(state)
+        if over is None:
+            return None
+        return np.tile(~over, (self.sensor_count, 1)), np.ones(state.truth.shape, dtype=np.bool_)
+
+    def _over(self, state: bases.Truth) -> NDArray[np.bool_] | None:
+        """Return the runs (N,) that have ended."""
+        controller = self.system.controller
+        return None if controller is None else controller.terminated(state.truth)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""
@@ -253,9 +352,9 @@ class NonlinearEstimator(bases.AdoptingEstimator[FilteredEstimate]):
         covariance = np.repeat(system.initial_covariance[..., None], runs, axis=-1)
         return FilteredEstimate.begin(measurement, mean, covariance, mean, covariance)
 
-    def predict(self, state: FilteredEstimate) -> FilteredEstimate:
+    def predict(self, state: FilteredEstimate, *control: Array) -> FilteredEstimate:
         """Predict."""
-        mean, covariance = self.system.predict(state.mean, state.covariance)
+        mean, covariance = self.system.predict(state.mean, state.covariance, *control)
         return state.later(prior_mean=mean, prior_covariance=linalg.symmetrise(covariance))
 
     def update(self, state: FilteredEstimate, reception: Reception) -> FilteredEstimate:

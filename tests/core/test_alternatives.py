@@ -24,7 +24,7 @@ from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.training.run import make_env
 from fusion_gym.validation import ConfigurationError
 
-OSCILLATOR = "fusion_gym/TobitOscillator-v1"
+OSCILLATOR, LINEAR = "fusion_gym/TobitOscillator-v1", "fusion_gym/LinearFusion-v2"
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": (OSCILLATOR, {"horizon": 6}),
     "starved": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "fixed"}),
@@ -47,6 +47,8 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
         OSCILLATOR, {"filter": "tobit", "memory": True, "true_process_noise": (0.5, 2.0),
                      "true_transition": (0.9, 1.1), "true_threshold_shift": 0.3},
     ),
+    "loop": (LINEAR, {"input_matrix": [[0.0], [0.5]], "memory": True, "horizon": 5}),
+    "loop, own": (LINEAR, {"input_matrix": [[0.0], [0.5]], "gain": [[0.5, 1.0]], "memory": True}),
     "many": ("fusion_gym/RemoteEstimation-v1", {"sensors": 70, "token_rate": 3.0}),
 }  # fmt: skip
 RUNS = 4
@@ -93,6 +95,7 @@ def test_alternatives_are_the_steps_that_would_have_been(name: str, owner: Owner
         for place, branch in enumerate(branches):
             outcome = branch.step(many[place], batch.normals())
             np.testing.assert_array_equal(result.error[:, place], outcome.error)
+            np.testing.assert_array_equal(result.reward_error[place], outcome.reward_error)
             np.testing.assert_array_equal(result.communication[place], outcome.reward_communication)
             np.testing.assert_array_equal(result.observation[place], branch.observe())
         assert contents(batch) == went

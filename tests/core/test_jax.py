@@ -74,7 +74,7 @@ def test_episodes_equal_numpy(name: str, options: dict[str, Any]) -> None:
             action = space.sample()
             outcome = batch.step(np.asarray(env.requests(action)))
             observation, state, result = step(noise[place + 1], state, action)
-            for ours, theirs in zip(result, outcome, strict=True):
+            for ours, theirs in zip(arrays_of(result), arrays_of(outcome), strict=True):
                 np.testing.assert_allclose(
                     np.asarray(ours, np.float64), theirs, rtol=1e-9, atol=1e-9
                 )

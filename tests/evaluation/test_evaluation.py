@@ -64,7 +64,8 @@ def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
         policy = make_policy(spec, task)
         policy.reset(1)
         env.reset(seed=10 + episode)
-        rows: dict[str, list[Any]] = {field.name: [] for field in fields(EpisodeResults)}
+        names = (field.name for field in fields(EpisodeResults))
+        rows: dict[str, list[Any]] = {n: [] for n in names if getattr(results, n) is not None}
         truncated = False
         while not truncated:
             requests = policy(batch.signals())[:, 0]
@@ -104,6 +105,8 @@ def test_results_do_not_depend_on_how_episodes_are_batched(
     assert sum(steps) == 11 * 12
     for field in fields(EpisodeResults):
         part, expected = (getattr(results, field.name) for results in (parts, whole))
+        if expected is None:
+            continue
         np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-12)
     assert not np.allclose(evaluate(task, "send_on_delta", 11, seed=500).mse, whole.mse)
 
@@ -129,7 +132,7 @@ def test_summary(task: Task) -> None:
     results = evaluate(task, "innovation_threshold", 40)
     summary = summarise(results)
     names = {"mse", "bound_trace", "nees", "tokens", "denied", "return"}
-    assert summary.keys() == METRICS.keys()
+    assert summary.keys() == {name for name, metric in METRICS.items() if not metric.loop}
     for name in names:
         samples = getattr(results, "returns" if name == "return" else name)
         assert summary[name]["mean"] == pytest.approx(np.mean(samples))

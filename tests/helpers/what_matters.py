@@ -17,6 +17,7 @@ import numpy as np
 
 from fusion_gym.arrays import merge_runs, take_runs
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.control import inputs_of
 from fusion_gym.core.knowledge import MEMORY_SIGNALS, NETWORK_SIGNALS, Knowledge, Signals, covers
 from fusion_gym.core.memory import Beliefs, Estimate, Memory
 from fusion_gym.core.task import Task
@@ -27,7 +28,7 @@ RUNS, STEPS = 6, 7
 TIME = ("step", "start", "token_cost")  # all runs know the costs, which never change
 CLOCK = (*TIME, "queue")
 OWN_ROW = ("admitted", "grantable", "queue")
-TOLD = (*TIME, "tokens", "price")
+TOLD = (*TIME, "tokens", "price", "control")
 
 
 class Believed:
@@ -96,10 +97,12 @@ def moved_otherwise(
         return batch
     task, before = batch.task, batch.delivered
     noise = rng.standard_normal((task.plant.noise_channels, batch.num_envs))
-    plant = task.plant.sense(before.plant, noise)
+    moving = inputs_of(before.control)
+    plant = task.plant.sense(before.plant, noise, *moving)
     measurement = task.plant.measurement(plant)
-    memory_posterior.observe(measurement)
-    estimate = task.estimator.observe(task.estimator.predict(before.estimate), measurement)
+    memory_posterior.observe(measurement, *moving)
+    predicted = task.estimator.predict(before.estimate, *moving)
+    estimate = task.estimator.observe(predicted, measurement)
     state = batch.state._replace(plant=plant, estimate=estimate)
     return with_states(batch, state, memory_posterior)
 

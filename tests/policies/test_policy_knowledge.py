@@ -52,6 +52,7 @@ ENVIRONMENTS: dict[str, tuple[str, Values]] = {
         "RemoteEstimation-v1",
         {"sources": (2, 0), "access": "slots", "channel": "gilbert_elliott"},
     ),
+    "closed loop": ("LinearFusion-v2", {"input_matrix": [[0.0], [1.0]]}),
     "remote, one link": (
         "RemoteEstimation-v1",
         {"sensors": 2, "cost_weight": 0.3, "access": "single", "noise_deviation": (1.0, 1.5)},
@@ -69,6 +70,7 @@ REMEMBERING: dict[str, tuple[str, Values]] = {
         "CorrelatedTracking-v1",
         {"token_rate": 1.0, "memory": True, "broadcast": "packets"},
     ),
+    "closed loop, memory": ("LinearFusion-v2", {"input_matrix": [[0.0], [1.0]], "memory": True}),
     "correlated, told": ("CorrelatedTracking-v1", {"token_rate": 1.0, "broadcast": "estimate"}),
     "remote, losses, memory": (
         "RemoteEstimation-v1",
@@ -286,6 +288,14 @@ def test_a_policy_that_lies_is_caught(name: str) -> None:
         assert f"{REFUSED[name]!r} belongs to the class" in str(caught.value)
     else:
         assert what in what_matters(make_policy(name, task), task)
+
+
+def test_every_sensor_knows_the_input_of_a_controller() -> None:
+    task = task_of("closed loop")
+    reader = Liar("own", lambda s: s["control"][0] * s["innovation"][:, 0])
+    assert what_matters(reader, task) == may_matter("own")
+    with pytest.raises(LookupError, match="'control' belongs to the class 'centre'"):
+        run_episodes(task, Liar("clock", lambda s: s["control"][0]), 2, 0)
 
 
 @pytest.mark.parametrize(("field", "value"), [("knowledge", "nobody"), ("node", "all")])

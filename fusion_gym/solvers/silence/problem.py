@@ -85,6 +85,7 @@ def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
         ConfigurationError: a task whose centre does not predict with the plant's matrix in silence,
             or weights that are not all above 0.
     """
+    task.refuse_control("for the bound")
     problem, estimator = None, task.estimator
     if isinstance(estimator, LinearEstimator):
         problem = estimator.linear_problem(task.plant, "for the bound")

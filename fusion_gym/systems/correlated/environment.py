@@ -23,6 +23,7 @@ from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.bases import numbered_states, trigger_parameters
 from fusion_gym.systems.correlated import filters, system
+from fusion_gym.systems.linear_control import ControlOptions, close_loop
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.schedule import read_schedule, scheduled_parts
 
@@ -36,7 +37,7 @@ _FILTERS = {"": filters.RobustKalmanFilter}  # without a choice
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingOptions(PaperOptions):
+class CorrelatedTrackingOptions(ControlOptions, PaperOptions):
     """A target whose position, velocity and acceleration are each measured by one sensor.
 
     One noise drives the three states, sampled every 0.01. Sensor 0 measures the position, sensor 1
@@ -123,6 +124,7 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     """Return the scenario of these options."""
     horizon = validation.horizon(options.horizon)
     plant, sensors = scheduled_parts(options, _SCHEDULED, _plant_and_sensors)
+    controller, plant = close_loop(options, plant)
     open_loop = plant.open_loop(horizon)
     chosen = options.own_weights(plant.size)
     weights = equal_weights(open_loop) if chosen is None else chosen
@@ -144,7 +146,8 @@ def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     if options.track_actual:
         estimator = estimator.with_actual_covariance()
     trigger = trigger_parameters(options, ("threshold", "offset", "sensitivity"), sensors.count)
-    return Scenario(options, truth, estimator, weights, {"adaptive_innovation": trigger})
+    defaults = {"adaptive_innovation": trigger}
+    return Scenario(options, truth, estimator, weights, defaults, controller=controller)
 
 
 def _plant_and_sensors(

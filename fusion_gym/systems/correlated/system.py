@@ -72,14 +72,17 @@ class CorrelatedTrackingPlant(SensorPlant[CorrelatedTrackingTruth]):
         time = np.zeros(noise.shape[-1])
         return CorrelatedTrackingTruth(truth, nothing, departure, time, scale), None
 
-    def sense(self, state: CorrelatedTrackingTruth, noise: Array) -> CorrelatedTrackingTruth:
+    def sense(
+        self, state: CorrelatedTrackingTruth, noise: Array, control: Array | None = None
+    ) -> CorrelatedTrackingTruth:
         """Move the plant, and measure with the same noise.
 
         Source: adaptive_innovation, equations (1)-(3).
         """
         actual, r = state.scale**0.5 * noise, self.dynamics.noise_channels
         process, own = true_noise(state.departure, actual[:r], actual[r:])
-        truth = self.dynamics.at(state.time).advance(state.truth, process, state.departure)
+        moving, departure = self.dynamics.at(state.time), state.departure
+        truth = moving.advance(state.truth, process, departure, control)
         time = state.time + 1.0
         measurement = self.sensors.at(time).measure(truth, process, own)
         return replace(state, truth=truth, measurement=measurement, time=time)
@@ -213,14 +216,16 @@ class CorrelatedTrackingEstimator(
             expected, np.zeros(runs), mean, covariance, expected, None, mean, covariance, joint
         )
 
-    def predict(self, state: CorrelatedTrackingEstimate) -> CorrelatedTrackingEstimate:
+    def predict(
+        self, state: CorrelatedTrackingEstimate, control: Array | None = None
+    ) -> CorrelatedTrackingEstimate:
         """Predict all estimates.
 
         Source: adaptive_innovation, equations (12), (40), (52).
         """
         time = state.time + 1.0
         model, filters = self.model.at(state.time), self._filters(time)
-        prior_mean, prior_covariance = model.predict(state.means, state.covariances)
+        prior_mean, prior_covariance = model.predict(state.means, state.covariances, control)
         joint = state.joint
         if self.joint is not None and joint is not None:
             joint = self.joint.predict(joint)

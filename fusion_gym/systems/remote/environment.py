@@ -22,6 +22,7 @@ from fusion_gym.core.token_bucket import TokenBucket, Tokens
 from fusion_gym.declaration import NumpyOnly
 from fusion_gym.errors import forbidden
 from fusion_gym.systems.bases import numbered_states
+from fusion_gym.systems.linear_control import ControlOptions, linear_controller
 from fusion_gym.systems.remote import vector
 from fusion_gym.systems.remote.system import RemoteEstimator, ScalarSources
 from fusion_gym.systems.silence import Silence, Trigger
@@ -30,7 +31,7 @@ _FILTERS: dict[str, type] = {"symmetric": RemoteEstimator, "truncated": Silence}
 
 
 @dataclass(frozen=True)
-class RemoteEstimationOptions(PaperOptions):
+class RemoteEstimationOptions(ControlOptions, PaperOptions):
     """Scalar sources that a remote estimator tracks at a price for every packet.
 
     The optimum of this problem is known. Source i follows x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and
@@ -112,13 +113,16 @@ def build_remote(options: RemoteEstimationOptions) -> Scenario:
     coefficient = validation.spread("coefficient", options.coefficient, (sensors,))
     initial = validation.not_negative("initial_deviation", options.initial_deviation, (sensors,))
     law = coefficient, deviation, initial
-    sources = ScalarSources(numbered_states(sensors), *law, _nature(options, coefficient))
+    controller, matrix = linear_controller(options, np.diag(coefficient))
+    nature = _nature(options, coefficient)
+    sources = ScalarSources(numbered_states(sensors), *law, nature, matrix)
     silence = _silence(options, sensors)
     return Scenario(
         options,
         sources,
         RemoteEstimator(sources, _error_scale(options, deviation), weights, silence),
         weights,
+        controller=controller,
         nodes_have_memory=True,  # a source's value is all that there is to know of it
         no_estimates="a packet carries the source's value",
         policy_defaults={} if silence is None else silence.policy_defaults,
@@ -135,6 +139,9 @@ def _build_vector(options: RemoteEstimationOptions) -> Scenario:
         vector.make_sources(options.sources), options, validation.horizon(options.horizon)
     )
     size, sensors = len(model.state_names), model.sensor_count
+    whole = model.whole(model.transition)[..., 0]
+    controller, matrix = linear_controller(options, whole)
+    model = replace(model, input_matrix=matrix)
     chosen = options.own_weights(size)
     weights = np.ones(size) if chosen is None else chosen
     steps = max(_SILENCE, round(float(_steps(options, sensors).max())))
@@ -144,6 +151,7 @@ def _build_vector(options: RemoteEstimationOptions) -> Scenario:
         model,
         estimator,
         weights,
+        controller=controller,
         nodes_have_memory=True,  # a node's estimate has all its measurements
         no_estimates="a packet carries the node's estimate",
     )

@@ -18,6 +18,7 @@ from fusion_gym.core.knowledge import Block, age_block, common_signals, numbered
 from fusion_gym.core.plant import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.namespace import namespace
 from fusion_gym.systems.bases import RANGE, Deliveries
+from fusion_gym.systems.linear_plant import steer
 from fusion_gym.systems.silence import Silence
 from fusion_gym.systems.solvable import IndependentSources
 
@@ -39,11 +40,14 @@ class SourceTruth:
 class ScalarSources(IndependentSources[SourceTruth]):
     """n independent sources x(t+1) = a x(t) + w(t), w ~ N(0, σ²), measured without noise.
 
+    ``input_matrix`` is B (n, k, 1) of a controller's input.
+
     Where the truth departs by ``nature``, a source moves by c a, because I + c (a - I) would not
     change a random walk.
     """
 
     nature: Nature = AS_ASSUMED
+    input_matrix: Array | None = None
     traceable = True
 
     @property
@@ -66,11 +70,12 @@ class ScalarSources(IndependentSources[SourceTruth]):
         noise, departure = self.nature.begin(noise)
         return SourceTruth(self.initial_deviation[:, None] * noise, departure), None
 
-    def sense(self, state: SourceTruth, noise: Array) -> SourceTruth:
+    def sense(self, state: SourceTruth, noise: Array, control: Array | None = None) -> SourceTruth:
         """Move the sources."""
         a, sigma = self.coefficient[:, None], self.deviation[:, None]
         moved = true_motion(state.departure, np.zeros(1), a * state.truth)
         drawn = true_noise(state.departure, noise, noise[:0])[0]
+        moved = steer(moved, self.input_matrix, control)
         return SourceTruth(moved + sigma * drawn, state.departure)
 
     def measurement(self, state: SourceTruth) -> Array:
@@ -187,11 +192,12 @@ class RemoteEstimator(Estimator[RemoteEstimate]):
         variance = np.repeat(self.model.initial_deviation[:, None] ** 2, nothing.shape[-1], axis=1)
         return RemoteEstimate(measurement, nothing, nothing, nothing, nothing, variance, variance)
 
-    def predict(self, state: RemoteEstimate) -> RemoteEstimate:
+    def predict(self, state: RemoteEstimate, control: Array | None = None) -> RemoteEstimate:
         """Predict the sources."""
         a, sigma = self.model.coefficient[:, None], self.model.deviation[:, None]
         variance = a * a * state.variance + sigma * sigma
-        return state.later(prior=a * state.mean, prior_variance=variance)
+        prior = steer(a * state.mean, self.model.input_matrix, control)
+        return state.later(prior=prior, prior_variance=variance)
 
     def update(self, state: RemoteEstimate, reception: Reception) -> RemoteEstimate:
         """Replace the centre's prediction where a packet arrives."""

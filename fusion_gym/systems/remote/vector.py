@@ -111,7 +111,7 @@ class VectorSources(NormalPlant, AgedSources[Truth]):
     Shapes: ``transition`` (l, s, s, 1), ``process_factor`` (l, s, s, 1), ``measurement_matrix``
     (l, m, s, 1), ``noise_factor`` (l, m, m, 1), the steady filters' ``gain`` (l, s, m, 1) and
     ``posterior`` P̄ (l, s, s, 1), zero beyond a source's own size. ``places`` (l, s) are the states'
-    numbers, n beyond.
+    numbers, n beyond. ``input_matrix`` is B (n, k, 1) of a controller's input.
     """
 
     state_names: tuple[str, ...]
@@ -123,6 +123,7 @@ class VectorSources(NormalPlant, AgedSources[Truth]):
     posterior: Array
     places: NDArray[np.int64]
     nature: Nature
+    input_matrix: Array | None = None
     traceable = True
 
     @classmethod
@@ -176,7 +177,7 @@ class VectorSources(NormalPlant, AgedSources[Truth]):
         nothing = xp.zeros((count, self.measurement_matrix.shape[1], runs))
         return Truth(self.flat(drawn), nothing, departure, np.zeros(runs)), None
 
-    def sense(self, state: Truth, noise: Array) -> Truth:
+    def sense(self, state: Truth, noise: Array, control: Array | None = None) -> Truth:
         """Move the sources, and measure."""
         count, channels, size, _ = self.measurement_matrix.shape
         split, runs = count * size, noise.shape[-1]
@@ -185,10 +186,16 @@ class VectorSources(NormalPlant, AgedSources[Truth]):
         process, own = true_noise(state.departure, moving, measured)
         before = self.blocks(state.truth)
         moved = true_motion(state.departure, before, linalg.matvec(self.transition, before))
-        truth = moved + linalg.matvec(self.process_factor, process)
+        truth = self.steer(moved, control) + linalg.matvec(self.process_factor, process)
         seen = linalg.matvec(self.measurement_matrix, truth)
         measurement = seen + linalg.matvec(self.noise_factor, own)
         return Truth(self.flat(truth), measurement, state.departure, state.time + 1.0)
+
+    def steer(self, moved: Array, control: Array | None) -> Array:
+        """Return states (l, s, N) with the effect of an input."""
+        if control is None or self.input_matrix is None:
+            return moved
+        return moved + self.blocks(linalg.matvec(self.input_matrix, control))
 
     def blocks(self, values: Array) -> Array:
         """Return values (n, N) of the states by source (l, s, N)."""
@@ -314,12 +321,12 @@ class VectorEstimator(Estimator[VectorEstimate]):
         age = xp.zeros((len(nothing), runs))
         return VectorEstimate(measurement, nothing, age, nothing, nothing, nothing, blocks, blocks)
 
-    def predict(self, state: VectorEstimate) -> VectorEstimate:
+    def predict(self, state: VectorEstimate, control: Array | None = None) -> VectorEstimate:
         """Predict at the nodes and at the centre."""
-        transition = self.model.transition
+        transition, steer = self.model.transition, self.model.steer
         return state.later(
-            node_mean=linalg.matvec(transition, state.node_mean),
-            prior=linalg.matvec(transition, state.mean),
+            node_mean=steer(linalg.matvec(transition, state.node_mean), control),
+            prior=steer(linalg.matvec(transition, state.mean), control),
             prior_blocks=self.model.predict_covariance(state.blocks),
         )
 

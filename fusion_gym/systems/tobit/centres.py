@@ -88,9 +88,9 @@ class Centre(Protocol):
             return self
         return replace(cast(Any, self), filter=replace(self.filter, sensors=sensors))
 
-    def advance(self, model: LinearPlant, state: Any) -> Prediction:
-        """Return the prediction one step after a state's delivery."""
-        prior = model.predict(state.mean, state.covariance)
+    def advance(self, model: LinearPlant, state: Any, control: Array | None) -> Prediction:
+        """Return the prediction one step after a state's delivery and an input (k, N)."""
+        prior = model.predict(state.mean, state.covariance, control)
         return self.predict(prior, state.held, state.time + 1.0)
 
     def predict(self, prior: Gaussian, held: Array, time: Array) -> Prediction:
@@ -492,8 +492,8 @@ class HoldCentre(Centre):
         moment[:n, :n] = covariance + linalg.outer(mean, mean)
         return self._predict(prior, held, moment)
 
-    def advance(self, model: LinearPlant, state: Any) -> Prediction:
-        """See :class:`Centre`; the estimate stays."""
+    def advance(self, model: LinearPlant, state: Any, control: Array | None) -> Prediction:
+        """See :class:`Centre`; the estimate stays, and there is no input."""
         before = state.prediction
         if before is None:
             runs, plant = state.mean.shape[-1], self.plant

@@ -26,8 +26,16 @@ from fusion_gym.errors import ConfigurationError, forbidden, refusal
 from fusion_gym.fusion.table import Structure
 from fusion_gym.namespace import namespace
 from fusion_gym.systems import bases, linear_plant
+from fusion_gym.systems.linear_control import ControlOptions, close_loop
 from fusion_gym.systems.solvable import LinearEstimator, LinearProblem, ParametricEstimator
-from fusion_gym.systems.tobit.centres import STRUCTURE, Centre, Filter, NodeCentre, Prediction
+from fusion_gym.systems.tobit.centres import (
+    STRUCTURE,
+    Centre,
+    Filter,
+    HoldCentre,
+    NodeCentre,
+    Prediction,
+)
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import choice
 
@@ -91,14 +99,14 @@ class CensoredPlant(bases.SensorPlant[bases.Truth], bases.NormalPlant):
         measurement = self.sensors.at(time).measure(truth, own, departure)
         return bases.Truth(truth, measurement, departure, time), mean
 
-    def sense(self, state: bases.Truth, noise: Array) -> bases.Truth:
+    def sense(self, state: bases.Truth, noise: Array, control: Array | None = None) -> bases.Truth:
         """Move the plant, and measure.
 
         Source: tobit_token_bucket, equations (1) and (2).
         """
         r, departure, time = self.dynamics.noise_channels, state.departure, state.time + 1.0
         process, own = true_noise(departure, noise[:r], noise[r:])
-        truth = self.dynamics.at(state.time).advance(state.truth, process, departure)
+        truth = self.dynamics.at(state.time).advance(state.truth, process, departure, control)
         measurement = self.sensors.at(time).measure(truth, own, departure)
         return bases.Truth(truth, measurement, departure, time)
 
@@ -338,7 +346,7 @@ class CensoredEstimator(
         result = self.update(replace(first, prediction=prediction), Reception(everyone))
         return replace(result, prediction=None, age=first.age)
 
-    def predict(self, state: CensoredEstimate) -> CensoredEstimate:
+    def predict(self, state: CensoredEstimate, control: Array | None = None) -> CensoredEstimate:
         """Predict at centre and nodes; held readings stay while the level moves.
 
         Source: tobit_token_bucket, equations (21), (23), (29).
@@ -348,7 +356,7 @@ class CensoredEstimator(
             held = held - (self._level(state, time) - self._level(state, state.time))
             state = replace(state, held=held)
         model, centre = self.model.at(state.time), self.centre.at(time)
-        prediction = centre.advance(model, state)
+        prediction = centre.advance(model, state, control)
         mean, covariance = prediction.prior
         state = replace(state, prior_mean=mean, prior_covariance=covariance, prediction=prediction)
         return state.later(time=time)
@@ -444,7 +452,7 @@ def _whitened(state: CensoredEstimate) -> Array:
 
 
 @dataclass(frozen=True)
-class FeedbackOptions(PaperOptions):
+class FeedbackOptions(ControlOptions, PaperOptions):
     """Options of the fusion and its feedback; ``None`` is the default of the filter or the rule."""
 
     structure: ClassVar[Structure | None] = STRUCTURE
@@ -503,7 +511,11 @@ def feedback_scenario(
     if not filters[kind].nodes:
         belongs = "a filter with nodes (here the centre uses the measurements)"
         _refuse(options, _OF_FUSION, where, belongs)
+    controller, closed = close_loop(options, plant)
+    model = closed if model is None else close_loop(options, model)[1]
+    plant = closed
     centre = filters[kind].make(options, sensors)
+    _refuse_held(options, centre, f"with {where}")
     if centre.reads_silence and options.channel != "perfect":
         raise refusal("channel", options.channel, "'perfect', because a loss is no silence", where)
     absent = ("true_threshold_shift",) if sensors.unlimited else ()
@@ -512,7 +524,7 @@ def feedback_scenario(
     if plant.schedule is None and sensors.schedule is None:
         plant.warn_of_unseen_growth(sensors.stacked_matrix, names)
     estimator = CensoredEstimator(
-        model=plant if model is None else model,
+        model=model,
         centre=centre,
         state_names=names,
         scale=linear_plant.typical_magnitude(plant, options.horizon, truth.random_start),
@@ -525,18 +537,27 @@ def feedback_scenario(
         changed: dict[str, Any] = dict.fromkeys(() if row.nodes else _OF_FUSION)
         changed["filter"] = other
         memory = replace(estimator, centre=row.make(replace(options, **changed), sensors))
+        _refuse_held(options, memory.centre, f"with memory_filter={other!r}")
     defaults: dict[str, Any] = dict(policy_defaults or {})
     if options.stochastic_weight is not None:
         defaults["stochastic_event"] = {"weight": plain_options(options.stochastic_weight)}
     return Scenario(
         options,
-        replace(truth, nature=nature),
+        replace(truth, dynamics=plant, nature=nature),
         estimator,
+        controller=controller,
         policy_defaults=defaults,
         feedback=True,
         memory_estimator=memory,
         **others,
     )
+
+
+def _refuse_held(options: FeedbackOptions, centre: Centre, where: str) -> None:
+    holds = isinstance(centre, HoldCentre) or getattr(centre.filter, "hold", False)
+    if options.input_matrix is not None and holds:
+        why = "a held value does not follow the input"
+        raise forbidden("input_matrix", options.input_matrix, why, where)
 
 
 def _refuse(options: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:
