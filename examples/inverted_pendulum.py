@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,6 +108,23 @@ class Periods:
         return (signals["step"] + [[0], [1]] * self.periods // 2) % self.periods == 0
 
 
+TRAINING = {
+    "environment": {"id": "examples/InvertedPendulum-v0"},
+    "algorithm": {
+        "name": "ppo",
+        "learning_rate": 0.002,
+        "learning_rate_end": 0.00001,
+        "n_steps": 32,
+        "batch_size": 2048,
+        "n_epochs": 4,
+        "gamma": 0.97,
+        "gae_lambda": 0.9,
+    },
+    "training": {"timesteps": 2_000_000, "num_envs": 256},
+    "validation": {"every": 200_000, "episodes": 256},
+    "output": "runs/inverted_pendulum",
+}
+
 if __name__ == "__main__":
     task = fusion_gym.make_task("examples/InvertedPendulum-v0")
     price = float(task.options.cost_weight)
@@ -126,7 +142,8 @@ if __name__ == "__main__":
     ]
     best = min((fusion_gym.make_policy(text, task) for text in texts), key=total)
     policies[f"value of information above {best.threshold:.3g}"] = best
-    policies |= {text: fusion_gym.make_policy(text, task) for text in sys.argv[1:]}
+    fusion_gym.train(fusion_gym.Experiment.model_validate(TRAINING))
+    policies["agent"] = fusion_gym.make_policy(f"model:{TRAINING['output']}/best_model.zip", task)
     print(f"{'policy':50s}  tokens  control cost   cost at price {price:g}")
     for name, policy in policies.items():
         results = fusion_gym.evaluation.run_episodes(task, policy, 1000, seed=0)
