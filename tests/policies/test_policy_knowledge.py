@@ -294,6 +294,7 @@ def test_every_sensor_knows_the_input_of_a_controller() -> None:
     task = task_of("closed loop")
     reader = Liar("own", lambda s: s["control"][0] * s["innovation"][:, 0])
     assert what_matters(reader, task) == may_matter("own")
+    run_episodes(task, reader, 2, 0)
     with pytest.raises(LookupError, match="'control' belongs to the class 'centre'"):
         run_episodes(task, Liar("clock", lambda s: s["control"][0]), 2, 0)
 
