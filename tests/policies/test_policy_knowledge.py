@@ -36,6 +36,7 @@ from fusion_gym.policies.registry import make_policy, policy_maker, policy_names
 from fusion_gym.policies.rules import BeliefRule
 from fusion_gym.validation import ConfigurationError
 
+LOOP: Values = {"input_matrix": [[0.0], [1.0]], "tokens": "unlimited"}
 ENVIRONMENTS: dict[str, tuple[str, Values]] = {
     "tobit": ("TobitOscillator-v1", {"filter": "tobit", "random_start": True}),
     "tobit, centre": ("TobitOscillator-v1", {"filter": "tobit", "information": "centre"}),
@@ -52,7 +53,7 @@ ENVIRONMENTS: dict[str, tuple[str, Values]] = {
         "RemoteEstimation-v1",
         {"sources": (2, 0), "access": "slots", "channel": "gilbert_elliott"},
     ),
-    "closed loop": ("LinearFusion-v2", {"input_matrix": [[0.0], [1.0]]}),
+    "closed loop": ("LinearFusion-v2", LOOP),
     "remote, one link": (
         "RemoteEstimation-v1",
         {"sensors": 2, "cost_weight": 0.3, "access": "single", "noise_deviation": (1.0, 1.5)},
@@ -70,7 +71,7 @@ REMEMBERING: dict[str, tuple[str, Values]] = {
         "CorrelatedTracking-v1",
         {"token_rate": 1.0, "memory": True, "broadcast": "packets"},
     ),
-    "closed loop, memory": ("LinearFusion-v2", {"input_matrix": [[0.0], [1.0]], "memory": True}),
+    "closed loop, memory": ("LinearFusion-v2", LOOP | {"memory": True}),
     "correlated, told": ("CorrelatedTracking-v1", {"token_rate": 1.0, "broadcast": "estimate"}),
     "remote, losses, memory": (
         "RemoteEstimation-v1",
