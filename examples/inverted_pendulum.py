@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -142,8 +143,10 @@ if __name__ == "__main__":
     ]
     best = min((fusion_gym.make_policy(text, task) for text in texts), key=total)
     policies[f"value of information above {best.threshold:.3g}"] = best
-    fusion_gym.train(fusion_gym.Experiment.model_validate(TRAINING))
-    policies["agent"] = fusion_gym.make_policy(f"model:{TRAINING['output']}/best_model.zip", task)
+    folder = Path(TRAINING["output"])
+    experiment = fusion_gym.Experiment.model_validate(TRAINING)
+    fusion_gym.train(experiment, resume=(folder / "latest.zip").exists())
+    policies["agent"] = fusion_gym.make_policy(f"model:{folder}/best_model.zip", task)
     print(f"{'policy':50s}  tokens  control cost   cost at price {price:g}")
     for name, policy in policies.items():
         results = fusion_gym.evaluation.run_episodes(task, policy, 1000, seed=0)

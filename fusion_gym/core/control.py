@@ -14,8 +14,8 @@ from fusion_gym.arrays import Array
 class Controller(ABC):
     """Define the input u of a plant as a function of the fused estimate, and the cost of the loop.
 
-    The input follows every delivery and acts until the next sensing; a late packet affects the next
-    input only. It is broadcast to every node without charge. The plant's ``sense`` and the
+    The input follows every delivery and acts until the next sensing; a late packet affects inputs
+    from its arrival on. It is broadcast to every node without charge. The plant's ``sense`` and the
     estimator's ``predict`` take it as a further argument ``control`` (k, N).
 
     Attributes:

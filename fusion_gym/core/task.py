@@ -277,10 +277,16 @@ class Task(Scenario):
         return self.options.objective or ("control" if self.controller else "estimation")
 
     @property
-    def steers(self) -> bool:
-        """Whether only simulations show what a packet is worth to the objective."""
+    def equivalent_error(self) -> bool:
+        """Whether policies rank by the weighted error as they do by the objective.
+
+        A controller's ``error_weights`` suppose its model and no weights in their place.
+        """
+        if self.objective != "control":
+            return True
         controller: Any = self.controller
-        return self.objective == "control" and controller.error_weights is None
+        own = self.options.state_weights is None and controller.error_weights is not None
+        return own and "true_transition" not in self.plant.nature.departing
 
     @property
     def broadcast(self) -> str:

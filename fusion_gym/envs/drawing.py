@@ -114,8 +114,11 @@ class Film:
             mark.set_data(times[places], sensors)
         for place, line in enumerate(self._inputs):
             line.set_data(times, [cast(Array, s.outcome.control)[place, run] for s in steps])
-            line.axes.relim()
-            line.axes.autoscale_view(scalex=False)
+        if self._inputs:
+            inputs: Any = [value for line in self._inputs for value in line.get_ydata()]
+            low, high = min(inputs, default=0.0), max(inputs, default=0.0)
+            margin = 0.1 * (high - low) + 1e-3
+            self._inputs[0].axes.set_ylim(low - margin, high + margin)
         if self._level is not None:
             self._level.set_data(times, [step.tokens[run] for step in steps])
         self._axes[-1].set_xlim(first, first + self._window + 1)

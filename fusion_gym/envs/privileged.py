@@ -118,8 +118,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         num_envs: Number N of runs.
         error: Error term of the rewards: ``"squared"`` is the task's own, ``"excess"`` and
             ``"mismatch"`` are defined in :meth:`~fusion_gym.core.reward.Reward.training_error`. The
-            returns in infos are the task's. With ``objective="control"`` and a controller with
-            error weights all are of the weighted error.
+            returns in infos are the task's. With ``objective="control"`` all are of the
+            weighted error where it ranks policies as the cost does.
         reference: Estimator of every measurement
             (:func:`reference_estimator`), needed unless ``error`` is ``"squared"``.
         **options: Keyword arguments of :class:`~fusion_gym.envs.sb3.FusionSB3VecEnv`.
@@ -145,8 +145,9 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         if error != "squared" and task.reward.error != "squared":
             allowed = f"'squared' with the task's error={task.reward.error_kind!r}"
             raise refusal("error", error, allowed)
-        if error != "squared" and task.steers:
-            raise refusal("error", error, "'squared' with a controller without error weights")
+        if error != "squared" and not task.equivalent_error:
+            allowed = "'squared', because no error ranks policies as the cost of the loop does"
+            raise refusal("error", error, allowed)
         super().__init__(task, num_envs, **options)
         if error != "squared":
             self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)
@@ -189,13 +190,16 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         self._observed = self.view.rows(observation)
         beliefs, local = self.batch.beliefs(), self.view.local
         result = alternatives(before, self._requests, noise, outcome, observation, beliefs, local)
-        term = result.reward_error if self.task.steers else self._error_term(result.error)
+        term = self._error_term(result.error)
+        if not self.task.equivalent_error:
+            term = result.reward_error
         reward = term + result.communication
         self._branched = Branched(reward * scale, result.observation)
         return outcome
 
     def _reward(self, outcome: Outcome) -> Array:
-        if self.error == "squared" and (self.task.steers or self.task.objective != "control"):
+        exchanged = self.task.objective == "control" and self.task.equivalent_error
+        if self.error == "squared" and not exchanged:
             return outcome.reward
         return self._error_term(outcome.error[:, None])[0] + outcome.reward_communication
 

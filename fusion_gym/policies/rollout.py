@@ -99,8 +99,8 @@ class Rollout:
 
     The cost is error_weight · ‖x* - x̂‖² + ``price`` for each token, with the reward's weights and
     x* the best estimate at that step. If x* is the conditional mean, the cost is the expected
-    squared error minus a part that no decision changes. Where a controller has no error weights, it
-    is the simulated cost of state and input instead.
+    squared error minus a part that no decision changes. Where the error of a closed loop
+    does not rank policies as its cost does, it is the simulated cost of state and input instead.
 
     With infinite ``samples`` and ``steps`` and a true model, its cost is at most the base's cost.
     One step takes samples · (steps + 1) · (sensors + 1) steps of the base.
@@ -238,7 +238,7 @@ class Rollout:
             outcome = branch.deliver(requests)
             missed = best - self._task.estimator.mean(branch.delivered.estimate)
             error = linalg.weighted_square(missed, self._weights)
-            if self._task.steers:
+            if not self._task.equivalent_error:
                 error = -outcome.reward_error
             cost += error + price * outcome.cost
             if step < self.steps:

@@ -147,7 +147,7 @@ class NonlinearSystem(ABC):
         Args:
             mean: estimate (n, N).
         """
-        raise NotImplementedError("a system with inputs must define 'control'")
+        raise NotImplementedError
 
     def cost(self, state: Array, control: Array) -> Array:
         """Return the cost (N,) >= 0 of a step; only with ``inputs``.
@@ -156,7 +156,7 @@ class NonlinearSystem(ABC):
             state: true state (n, N).
             control: input (k, N).
         """
-        raise NotImplementedError("a system with inputs must define 'cost'")
+        raise NotImplementedError
 
     def terminated(self, state: Array) -> NDArray[np.bool_] | None:
         """Return the runs (N,), bool, that end here, as a fall does; ``None`` is none.
@@ -171,6 +171,10 @@ class NonlinearSystem(ABC):
     @functools.cached_property
     def controller(self) -> NonlinearController | None:
         """The controller, for a scenario; ``None`` without ``inputs``."""
+        for name in ("control", "cost") if self.inputs else ():
+            if getattr(type(self), name) is getattr(NonlinearSystem, name):
+                reason = f"{type(self).__name__} must define {name!r}"
+                raise ConfigurationError(f"inputs = {self.inputs} is not allowed: {reason}")
         return NonlinearController(self) if self.inputs else None
 
     @functools.cached_property

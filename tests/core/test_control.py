@@ -446,17 +446,53 @@ def test_training_sees_the_cost_of_the_loop() -> None:
     np.testing.assert_allclose(expected.reward_error, -cost)
     refused(
         lambda: PrivilegedVecEnv(task, 3, error="mismatch", reference=task.estimator),
-        "error = 'mismatch'", "without error weights",
+        "error = 'mismatch'", "cost of the loop",
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "exchanged"),
+    [({}, True), ({"state_weights": [1.0, 1.0]}, False), ({"true_transition": 0.9}, False)],
+)
+def test_an_agent_learns_from_errors_only_where_they_rank_as_the_cost(
+    options: Options, exchanged: bool
+) -> None:
+    """By the controller's own weights, in the model of its regulator."""
+    task = build("linear", horizon=20, **options)
+    envs = PrivilegedVecEnv(task, 3)
+    envs.seed(0)
+    envs.reset()
+    _, rewards, *_ = envs.step(np.ones((3, 2), int))
+    outcome = EpisodeBatch.seeded(task, 3, 0).step(np.ones((2, 3), bool))
+    reward = outcome.reward
+    if exchanged:
+        controller: Any = task.controller
+        scaled = task.reward.control_scale * controller.error_weights
+        error = np.einsum("in,ij,jn->n", outcome.error, scaled, outcome.error)
+        reward = outcome.reward_communication - error
+    np.testing.assert_allclose(rewards, reward, rtol=1e-6)
+
+
+def test_a_new_episode_empties_the_strip_of_the_input() -> None:
+    env: Any = gymnasium.make(LINEAR, render_mode="rgb_array", **INPUT)
+    env.reset(seed=0)
+    empty = env.render()
+    for _ in range(3):
+        env.step(np.ones(2, int))
+    assert (env.render() != empty).any()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), empty)
 
 
 # --- refusals -----------------------------------------------------------------------------------
 
 
-class NoInput(Regulated):
-    """Its methods take no input."""
+class Uncontrolled(linear_case.Linear):
+    """It has inputs and no method for them."""
 
-    move = linear_case.Linear.move  # type: ignore[assignment]
+    def __init__(self) -> None:
+        super().__init__()
+        self.inputs = 1
 
 
 class Constant(Controller):
@@ -518,6 +554,9 @@ REFUSALS: dict[str, tuple[Callable[[], Any], tuple[str, ...]]] = {
         ),
         ("inputs = 1", "controller"),
     ),
+    "a system without its methods": (
+        lambda: Uncontrolled().controller, ("inputs = 1", "'control'"),
+    ),
     "a plant without an input": (
         lambda: own_task(with_a_plant_without_input), ("controller", "'control'"),
     ),
@@ -531,7 +570,7 @@ REFUSALS: dict[str, tuple[Callable[[], Any], tuple[str, ...]]] = {
         ),
         ("controller", "solves estimation"),
     ),
-    "the truth by itself": (
+    "a recording": (
         lambda: fusion_gym.make_task(
             "fusion_gym/RecordedFusion-v1", input_matrix=[[0.0], [1.0]]
         ),

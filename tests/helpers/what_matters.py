@@ -163,7 +163,7 @@ def other_runs(values: Values, rng: np.random.Generator) -> Values:
 
 
 def of_sensor(sensor: int, true: Values, other: Values, batch: EpisodeBatch) -> Values:
-    """``true`` where the sensor knows it by itself or everyone is told, ``other`` elsewhere."""
+    """``true`` where the sensor has it or everyone is told, ``other`` elsewhere."""
     signals = (*batch.task.estimator.signals, *MEMORY_SIGNALS, *NETWORK_SIGNALS)
     own = {signal.name for signal in signals if signal.known_to("own_memory")}
 
