@@ -43,29 +43,37 @@ class Controller(ABC):
         """
 
     @abstractmethod
-    def cost(self, truth: Array, control: Array) -> Array:
+    def cost(self, state: Any, control: Array) -> Array:
         """Return the cost (N,) of a step, >= 0.
 
         Args:
-            truth: The plant's state (n, N).
+            state: State of the plant; :meth:`~fusion_gym.Plant.truth` has its numbers (n, N).
             control: Input (k, N).
         """
 
-    def terminal_cost(self, truth: Array) -> Array | None:
+    def terminal_cost(self, state: Any) -> Array | None:
         """Return the cost (N,) of the state at the end of an episode; ``None`` is zero.
 
         Args:
-            truth: The plant's state (n, N).
+            state: State of the plant.
         """
         return None
 
-    def terminated(self, truth: Array) -> NDArray[np.bool_] | None:
+    def terminated(self, state: Any) -> NDArray[np.bool_] | None:
         """Return the runs (N,) whose episode ends, and which stay ended; ``None`` is never.
 
-        The step that ends a run is charged for each step that is left.
+        The step that ends a run is also charged for each step that is left.
 
         Args:
-            truth: The plant's state (n, N).
+            state: State of the plant.
+        """
+        return None
+
+    def forfeit(self, state: Any) -> Array | None:
+        """Return the cost (N,) of each step that is left after an end; ``None`` is the last cost.
+
+        Args:
+            state: State of the plant.
         """
         return None
 
@@ -80,10 +88,10 @@ def control_of(task: Any, plant: Any, estimate: Any) -> Array | None:
     if task.controller is None:
         return None
     control: Array = task.controller.act(task.estimator.mean(estimate))
-    over = over_of(task, task.plant.truth(plant))
+    over = over_of(task, plant)
     return control if over is None else np.where(over, 0.0, control)
 
 
-def over_of(task: Any, truth: Array) -> NDArray[np.bool_] | None:
-    """Return the runs (N,) that the controller has ended."""
-    return None if task.controller is None else task.controller.terminated(truth)
+def over_of(task: Any, plant: Any) -> NDArray[np.bool_] | None:
+    """Return the runs (N,) that have ended in a state of the plant."""
+    return None if task.controller is None else task.controller.terminated(plant)

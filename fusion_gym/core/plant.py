@@ -186,6 +186,7 @@ class Plant(ABC, Generic[StateT]):
         state_names: Names of the n states.
         nature: Departure of the truth from the model.
         traceable: Whether JAX traces the methods, so that compiled code and JAX run them, too.
+        branches: Whether a state can be moved twice, by different inputs or noise.
         censored_beyond: Lowest and highest uncensored value of a state, by its number, for
             pictures.
 
@@ -202,6 +203,7 @@ class Plant(ABC, Generic[StateT]):
     state_names: tuple[str, ...]
     nature: Nature = AS_ASSUMED
     traceable: bool = False
+    branches: bool = True
     censored_beyond: Mapping[int, tuple[float, float]] = _NOTHING
 
     @property

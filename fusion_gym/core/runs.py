@@ -166,7 +166,7 @@ class Runs:
         self._delivered = after
         estimator, estimate, spent = task.estimator, after.estimate, delivery.spent
         truth = task.plant.truth(state.plant)
-        error, over = truth - estimator.mean(estimate), over_of(task, truth)
+        error, over = truth - estimator.mean(estimate), over_of(task, state.plant)
         if state.known is not None:
             error = np.where(state.known, error, 0.0)
         if over is not None:  # a run that ended before has no errors
@@ -177,33 +177,35 @@ class Runs:
         arrived = arrived if late is None else arrived | late.any(0)
         diverged = namespace(square).logical_not(square <= task.divergence_level).any(0)
         self.steps = self.steps + 1
-        error_term, cost = self._close_loop(error_term, truth, after.control, over)
+        error_term, cost = self._close_loop(error_term, state.plant, after.control, over)
         flags, total = (requested, delivery.granted, arrived), error_term + token_term
         terms = total, error_term, token_term, spent
         last: Any = diverged, self.steps >= self.limit, cost, after.control, over
         return Outcome(*terms, *flags, error, square, *last)
 
     def _close_loop(
-        self, error_term: Array, truth: Array, control: Array | None, over: Any
+        self, error_term: Array, plant: Any, control: Array | None, over: Any
     ) -> tuple[Array, Array | None]:
         """Return the error term (N,) and the cost of state and input; an end charges what is left.
 
         Args:
             error_term: Error term (N,) of the estimation.
-            truth: The plant's state (n, N).
+            plant: State of the plant.
             control: Input (k, N), with a controller.
             over: Runs (N,) that the controller ends.
         """
         controller, task, last = self.task.controller, self.task, self.steps >= self.limit
         if controller is None or control is None:
             return error_term, None
-        cost, end = controller.cost(truth, control), controller.terminal_cost(truth)
+        cost, end = controller.cost(plant, control), controller.terminal_cost(plant)
         if end is not None:
             cost = cost + namespace(cost).where(last, end, 0.0)
         if over is not None:
             left = np.where(over, np.maximum(1 + self.limit - self.steps, 0), 1)
             self.limit = np.where(over, np.minimum(self.limit, self.steps), self.limit)
-            error_term, cost = (np.where(left, left * each, 0.0) for each in (error_term, cost))
+            later: Any = cost if (each := controller.forfeit(plant)) is None else each
+            error_term = np.where(left, left * error_term, 0.0)
+            cost = np.where(left, cost + (left - 1) * later, 0.0)
         if task.objective == "control":
             error_term = task.reward.control_term(cost)
         return error_term, cost
@@ -226,6 +228,7 @@ class Runs:
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
         """Return independent copies of ``runs``, possibly repeated, by default of all."""
+        self.task.refuse_branches("in alternatives")
         memory = self.memory.branch(runs, len(self.steps))
         return Branch(self.task, memory, self.layout, self.position(runs))
 

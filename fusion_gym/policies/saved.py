@@ -35,6 +35,7 @@ import numpy as np
 import sb3_contrib
 import stable_baselines3
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
@@ -518,6 +519,31 @@ def model_file(path: str) -> Path:
     return file
 
 
+def load_controller(path: str, observations: spaces.Box, actions: spaces.Space[Any]) -> Any:
+    """Return the agent of an environment, from its weights alone, for these spaces.
+
+    Args:
+        path: the file, with or without ``.zip``.
+        observations: space of the environment's observations.
+        actions: space of its actions.
+
+    Raises:
+        ConfigurationError: no such file, or an agent of other spaces or another algorithm.
+    """
+    file = model_file(path)
+    try:
+        data = read_plain(file)
+        algorithm, arguments, shape, _ = read_declaration(data)
+        if shape != observations.shape:
+            raise refusal("shape", shape, f"{observations.shape}, as the observation has")
+        if "gae_lambda" in data and data.get("_last_original_obs") is not None:
+            raise refusal("normalize", True, "an agent without VecNormalize")
+        return _model(algorithm, arguments, read_weights(file), observations, actions)
+    except ConfigurationError as error:
+        other = "a function that calls the loaded model does as well"
+        raise ConfigurationError(f"model {path!r} is not allowed: {error}; {other}") from None
+
+
 def _rebuilt(
     file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
 ) -> tuple[BaseAlgorithm, str]:
@@ -525,18 +551,33 @@ def _rebuilt(
     algorithm, arguments, shape, actions = read_declaration(data)
     weights = read_weights(file)
     action, view = _fitted(task, observed, shape, actions)
-    # Without environment, buffers and optimiser, so it cannot learn.
+    model = _model(algorithm, arguments, weights, view.space, view.action.space)
+    if algorithm == "dqn":  # its random decisions need the exploration rate
+        rate = data.get("exploration_rate", 0.0)
+        rate = validation.number("exploration_rate", rate, at_least=0.0, at_most=1.0)
+        model.exploration_rate = rate
+    return model, action
+
+
+def _model(
+    algorithm: str,
+    arguments: Arguments,
+    weights: dict[str, torch.Tensor],
+    observations: spaces.Box,
+    actions: spaces.Space[Any],
+) -> Any:
+    """Return a model without environment, buffers and optimiser, so it cannot learn."""
     kind: Any = ALGORITHMS[algorithm]
     base = POLICIES[algorithm]
     model = kind(base, env=None, device="cpu", _init_setup_model=False)
-    model.observation_space, model.action_space = view.space, view.action.space
+    model.observation_space, model.action_space = observations, actions
     # On the meta device the declared networks take no memory before the weights fit them.
     meta = torch.device("meta")
     try:
         with meta:
             model.policy = type("Declared", (base,), {"device": meta})(
-                view.space,
-                view.action.space,
+                observations,
+                actions,
                 lr_schedule=lambda _: 0.0,
                 optimizer_class=lambda *_, **__: None,
                 **arguments,
@@ -545,11 +586,7 @@ def _rebuilt(
     except Exception:  # a crafted file may declare anything
         raise NeedsTrust(f"its weights do not fit {algorithm}") from None
     model.policy.__class__ = base
-    if algorithm == "dqn":  # its random decisions need the exploration rate
-        rate = data.get("exploration_rate", 0.0)
-        rate = validation.number("exploration_rate", rate, at_least=0.0, at_most=1.0)
-        model.exploration_rate = rate
-    return model, action
+    return model
 
 
 def _unpickled(

@@ -67,14 +67,14 @@ class LinearController(Controller):
         """Return -L x̂."""
         return -linalg.matvec(self.gain, mean)
 
-    def cost(self, truth: Array, control: Array) -> Array:
+    def cost(self, state: Any, control: Array) -> Array:
         """Return xᵀQx + uᵀRu."""
         quadratic = linalg.quadratic
-        return quadratic(truth, self.state_cost) + quadratic(control, self.input_cost)
+        return quadratic(state.truth, self.state_cost) + quadratic(control, self.input_cost)
 
-    def terminal_cost(self, truth: Array) -> Array | None:
+    def terminal_cost(self, state: Any) -> Array | None:
         """Return the quadratic cost of the last state."""
-        return None if self.terminal is None else linalg.quadratic(truth, self.terminal)
+        return None if self.terminal is None else linalg.quadratic(state.truth, self.terminal)
 
 
 def close_loop(options: Any, plant: LinearPlant) -> tuple[LinearController | None, LinearPlant]:

@@ -237,16 +237,16 @@ class NonlinearController(Controller):
         """Return the system's input."""
         return _checked("control", self.system.control(mean), (self.system.inputs, mean.shape[-1]))
 
-    def cost(self, truth: Array, control: Array) -> Array:
+    def cost(self, state: bases.Truth, control: Array) -> Array:
         """Return the system's cost."""
-        cost = _checked("cost", self.system.cost(truth, control), truth.shape[-1:])
+        cost = _checked("cost", self.system.cost(state.truth, control), control.shape[-1:])
         if not np.all(cost >= 0.0):
             raise ValueError(f"cost of {cost.min()} is not allowed: it must be >= 0")
         return cost
 
-    def terminated(self, truth: Array) -> NDArray[np.bool_] | None:
+    def terminated(self, state: bases.Truth) -> NDArray[np.bool_] | None:
         """Return the runs that the system ends."""
-        return self.system.terminated(truth)
+        return self.system.terminated(state.truth)
 
 
 def _checked(name: str, values: Array, shape: tuple[int, ...]) -> Array:
@@ -309,7 +309,7 @@ class NonlinearPlant(bases.NormalPlant):
     def _over(self, state: bases.Truth) -> NDArray[np.bool_] | None:
         """Return the runs (N,) that have ended."""
         controller = self.system.controller
-        return None if controller is None else controller.terminated(state.truth)
+        return None if controller is None else controller.terminated(state)
 
     def open_loop(self, horizon: int) -> Array:
         """Return the mean squared error (n,) of predictions over t = 1..horizon in 1,000 runs."""

@@ -377,9 +377,9 @@ def fallen(horizon: int = 60, **options: Any) -> tuple[Task, np.ndarray, int]:
     batch, costs = EpisodeBatch.seeded(task, 1, 5), []
     controller: Any = task.controller
     for _ in range(horizon):
-        truth = task.plant.truth(batch.state.plant).copy()
+        state = batch.state.plant
         outcome = batch.step(np.zeros((2, 1), bool))
-        costs.append(controller.cost(truth, outcome.control)[0])
+        costs.append(controller.cost(state, outcome.control)[0])
         if outcome.ended[0]:
             break
     assert outcome.terminated[0]
@@ -501,8 +501,8 @@ class Constant(Controller):
     def act(self, mean: np.ndarray) -> np.ndarray:
         return 0.0 * mean[:1]
 
-    def cost(self, truth: np.ndarray, control: np.ndarray) -> np.ndarray:
-        return (truth**2).sum(0)
+    def cost(self, state: Any, control: np.ndarray) -> np.ndarray:
+        return (state.truth**2).sum(0)
 
 
 def without_controller(options: CommonOptions) -> Scenario:

@@ -142,6 +142,8 @@ def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
             continue
         weighted = task.reward.state_weights * size
         error = weighted.max(0) if selection["error"] == "maximum" else weighted.sum(0)
+        if task.objective == "control":
+            error = task.reward.control_scale * outcome.control_cost
         np.testing.assert_allclose(outcome.reward_error, -selection["error_weight"] * error)
         np.testing.assert_allclose(outcome.reward_communication, -price * outcome.cost)
         np.testing.assert_array_equal(

@@ -1,0 +1,174 @@
+"""Any Gymnasium environment as the plant: its own returns, agents, predictors, refusals."""
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from numpy.typing import NDArray
+from refusals import refused
+from stable_baselines3 import PPO
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.envs.gymnasium_environment import balance
+from fusion_gym.evaluation import run_episodes
+
+ID = "fusion_gym/GymnasiumEnvironment-v1"
+SWING: dict[str, Any] = {
+    "env_id": "Pendulum-v1", "sensor_indices": [[0, 1], [2]], "best_reward": 0.0,
+}  # fmt: skip
+
+
+def lean(observations: NDArray[Any]) -> Any:
+    """Push the cart against its pole's angle alone, which fails soon."""
+    return (observations[:, 2] > 0.0).astype(int)
+
+
+def swing(observations: NDArray[Any]) -> Any:
+    return -observations[:, 1:2] - 0.5 * observations[:, 2:]
+
+
+def task_of(**options: Any) -> Task:
+    return fusion_gym.make_task(ID, **options)
+
+
+def own_return(task: Task, seed: int, controller: Callable[..., Any], **more: Any) -> float:
+    """The return of the environment itself, without sensors and network."""
+    batch = EpisodeBatch.seeded(task, 1, seed)
+    noise = batch.source.start(seed, 0, 1)
+    env: Any = gymnasium.make(task.settings["env_id"], max_episode_steps=task.horizon, **more)
+    seen, _ = env.reset(seed=int(noise.view(np.uint64)[0]) >> 21)
+    total, over = 0.0, False
+    while not over:
+        action = np.asarray(controller(seen[None]))[0]
+        seen, reward, *ends, _ = env.step(action)
+        total, over = total + float(reward), any(ends)
+    return total
+
+
+@pytest.mark.parametrize(
+    ("options", "controller"),
+    [
+        ({"controller": lean}, lean),
+        ({}, balance),
+        (SWING | {"controller": swing, "env_kwargs": {"g": 9.0}}, swing),
+    ],
+)
+def test_an_episode_costs_what_the_environment_returns_less(
+    options: dict[str, Any], controller: Callable[..., Any]
+) -> None:
+    task = task_of(horizon=120, **options)
+    results = run_episodes(task, fusion_gym.make_policy("always", task), 4, seed=7)
+    best, own = task.settings["best_reward"], options.get("env_kwargs") or {}
+    expected = [best - own_return(task, 7 + i, controller, **own) / 120 for i in range(4)]
+    np.testing.assert_allclose(results.control_cost, expected, atol=1e-12)
+    assert results.control_cost is not None
+    spent = 0.1 * results.tokens
+    np.testing.assert_allclose(-results.returns, 120 * (results.control_cost + spent))
+    assert (results.mse == 0.0).all() or controller is lean  # a fall is not transmitted
+    assert max(expected) > 0.1 or controller is balance
+
+
+def test_an_agent_of_stable_baselines_acts(tmp_path: Path) -> None:
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=64, batch_size=64, seed=0, device="cpu")
+    model.learn(64).save(tmp_path / "agent.zip")
+
+    def act(seen: NDArray[Any]) -> Any:
+        return model.predict(seen, deterministic=True)[0]
+
+    agents = f"model:{tmp_path}/agent.zip", act
+    tasks = [task_of(controller=agent, horizon=40) for agent in agents]
+    saved, loaded = (
+        run_episodes(task, fusion_gym.make_policy("periodic:period=3", task), 5) for task in tasks
+    )
+    assert saved.control_cost is not None
+    np.testing.assert_array_equal(saved.control_cost, loaded.control_cost)
+    seen = np.random.default_rng(0).normal(size=(4, 6))
+    controller: Any = tasks[0].controller
+    np.testing.assert_array_equal(controller.act(seen)[0], act(seen.T.astype(np.float32)))
+    refused(lambda: task_of(**SWING, controller=agents[0]), "agent.zip", "(3,)")
+
+
+def test_a_predictor_carries_the_estimate_through_silence() -> None:
+    """CartPole's step is linear, but for its acceleration; the pendulum's is not."""
+    linear = task_of(predictor="linear")
+    plant: Any = linear.plant
+    assert plant.system.explained_variance.min() > 0.98
+    still = task_of(predictor=lambda seen, action: seen + 0.0 * action[:, None])
+    errors = [
+        run_episodes(task, fusion_gym.make_policy("periodic:period=4", task), 20, 0).mse.mean()
+        for task in (task_of(), linear, still)
+    ]
+    assert errors[1] < 0.01 * errors[0]
+    assert errors[2] < errors[0]  # it corrects entries by what others show
+    pendulum: Any = task_of(**SWING, controller=swing, predictor="linear").plant
+    assert pendulum.system.explained_variance[0] < 0.7
+
+
+def test_live_environments_cannot_go_back() -> None:
+    batch = EpisodeBatch.seeded(task_of(), 2, 0)
+    state, every = batch.state.plant, np.ones((2, 2), bool)
+    batch.step(every)
+    refused(lambda: batch.task.plant.sense(state, np.zeros((0, 2)), np.zeros((1, 2))), "branch")
+    refused(batch.branch, "its states cannot branch")
+    refused(lambda: pickle.dumps(batch.state), "its states cannot branch")
+    with pytest.warns(UserWarning, match="GymnasiumPlant"):
+        EpisodeBatch.seeded(task_of(backend="compiled"), 1, 0)
+    refused(lambda: fusion_gym.make_policy("rollout:base=always", task_of()), "GymnasiumPlant")
+
+
+class Wordy(gymnasium.Env[Any, Any]):
+    """Its observation is a dictionary."""
+
+    observation_space = spaces.Dict({"a": spaces.Discrete(2)})
+    action_space = spaces.Discrete(2)
+
+
+class Tuples(Wordy):
+    """Its action is a tuple."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (4,))
+    action_space = spaces.Tuple((spaces.Discrete(2),))
+
+
+@pytest.fixture(autouse=True)
+def environments(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in (Wordy, Tuples):
+        name = f"{kind.__name__}-v0"
+        spec = gymnasium.envs.registration.EnvSpec(name, entry_point=kind)
+        monkeypatch.setitem(gymnasium.registry, name, spec)
+
+
+REFUSALS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "another id": ({"env_id": "CartPoler-v9"}, ("env_id = 'CartPoler-v9'", "gymnasium.make")),
+    "another argument": ({"env_kwargs": {"speed": 3}}, ("env_kwargs", "speed")),
+    "no dictionary": ({"env_kwargs": 3}, ("env_kwargs = 3",)),
+    "an entry that is not there": (
+        {"sensor_indices": [[0, 1], [2, 4]]},
+        ("sensor_indices", "0 to 3"),
+    ),
+    "an entry of nobody": ({"sensor_indices": [[0, 1], [2]]}, ("sensor_indices", "all of them")),
+    "a sensor of nothing": ({"sensor_indices": [[0, 1, 2, 3], []]}, ("sensor_indices",)),
+    "an entry twice": ({"sensor_indices": [[0, 1, 1], [2, 3]]}, ("sensor_indices",)),
+    "half an entry": ({"sensor_indices": [[0, 1.5], [2, 3]]}, ("sensor_indices",)),
+    "a dictionary as observation": ({"env_id": "Wordy-v0"}, ("env_id = 'Wordy-v0'", "vector")),
+    "a tuple as action": ({"env_id": "Tuples-v0"}, ("env_id = 'Tuples-v0'", "Tuple")),
+    "no function": ({"controller": 3}, ("controller = 3", "function")),
+    "an agent of nobody": ({"controller": "model:absent.zip"}, ("absent.zip", "no such file")),
+    "two actions": ({"controller": lambda seen: np.zeros((len(seen), 2))}, ("controller", "shape")),
+    "no predictor": ({"predictor": 3}, ("predictor = 3", "'hold'")),
+    "half a prediction": ({"predictor": lambda seen, _: seen[:, :2]}, ("predictor", "shape")),
+    "more than the best": ({"best_reward": 0.5}, ("best_reward = 0.5", "at least 1")),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_what_does_not_fit_is_refused(name: str) -> None:
+    options, parts = REFUSALS[name]
+    refused(lambda: task_of(**options), *parts)
