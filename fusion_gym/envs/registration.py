@@ -77,7 +77,7 @@ ENVIRONMENTS: dict[str, str | Build] = {
     "fusion_gym/LinearFusion-v2": "fusion_gym.systems.tobit.linear:build_linear",
     "fusion_gym/RecordedFusion-v1": "fusion_gym.recordings.environment:build_recorded",
     "fusion_gym/RemoteEstimation-v1": "fusion_gym.systems.remote.environment:build_remote",
-    "fusion_gym/GymnasiumEnvironment-v1": ("fusion_gym.envs.gymnasium_environment:build_gymnasium"),
+    "fusion_gym/GymnasiumEnvironment-v1": "fusion_gym.envs.gymnasium_environment:build_gymnasium",
 }
 
 
