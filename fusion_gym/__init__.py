@@ -14,7 +14,7 @@ from fusion_gym.validation import ConfigurationError
 from fusion_gym.version import __version__
 
 if TYPE_CHECKING:
-    from fusion_gym import evaluation, jax, zoo
+    from fusion_gym import evaluation, jax, wrappers, zoo
     from fusion_gym.core.control import Controller
     from fusion_gym.core.estimator import Estimator, Reception
     from fusion_gym.core.knowledge import Block, Signal, age_block
@@ -62,6 +62,7 @@ __all__ = [
     "register",
     "register_policy",
     "train",
+    "wrappers",
     "zoo",
 ]
 
@@ -105,6 +106,6 @@ if not TYPE_CHECKING:  # type checkers see only the names above
                     extra = _EXTRAS.get(module, "agents")
                     missing = f"{error}: install fusion-gym with its extra {extra!r}"
                     raise ModuleNotFoundError(missing, name=error.name) from None
-        if name in ("evaluation", "jax", "zoo"):
+        if name in ("evaluation", "jax", "wrappers", "zoo"):
             return importlib.import_module(f"{__name__}.{name}")
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

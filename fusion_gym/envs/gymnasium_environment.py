@@ -20,14 +20,19 @@ from fusion_gym.core.plant import Plant
 from fusion_gym.core.task import CommonOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.declaration import Mark
+from fusion_gym.envs.predictor import (
+    Predict,
+    Predictor,
+    action_of,
+    check_indices,
+    check_spaces,
+    sample,
+)
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.importing import import_named
 from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.nonlinear import FilteredEstimate, NonlinearEstimator, NonlinearSystem
 
-_SEED, _EPISODES, _STEPS = 0, 20, 200  # of the episodes that fit a predictor and scale observations
-_RANDOM = 0.2  # share of their actions that is random
-_ACTIONS = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
 Function = Callable[..., Any]
 
 
@@ -54,6 +59,20 @@ class GymnasiumEnvironmentOptions(CommonOptions):
     Starting state: the environment's own reset; its seed follows from the seed of the episode.
 
     The default is CartPole-v1 with one sensor of the cart and one of the pole.
+
+    Example:
+        >>> import fusion_gym
+        >>> def swing(observations):
+        ...     return -observations[:, 1:2] - 0.5 * observations[:, 2:]
+        >>> task = fusion_gym.make_task(
+        ...     "fusion_gym/GymnasiumEnvironment-v1",
+        ...     env_id="Pendulum-v1",
+        ...     controller=swing,
+        ...     sensor_indices=[[0, 1], [2]],
+        ...     best_reward=0.0,
+        ... )
+        >>> task.plant.system.explained_variance.shape
+        (3,)
     """
 
     env_id: str = "CartPole-v1"
@@ -67,7 +86,7 @@ class GymnasiumEnvironmentOptions(CommonOptions):
     deterministic."""
     sensor_indices: Sequence[Sequence[int]] = ((0, 1), (2, 3))
     """Entries of the observation that each sensor measures; together all entries."""
-    predictor: str | Callable[[Array, Any], Any] = "hold"
+    predictor: Predict = "hold"
     """Estimate of the entries that are not transmitted: ``"hold"`` keeps them, ``"linear"`` fits
     the next observation to observation and action, or a function from estimates (N, n) and actions
     to next estimates (N, n), or its ``"module:name"``."""
@@ -81,11 +100,19 @@ class GymnasiumEnvironmentOptions(CommonOptions):
 
 
 class Episode:
-    """One episode of a live environment, which counts its moves and never goes back."""
+    """One episode of a live environment, which counts its moves and never goes back.
 
-    def __init__(self, pool: list[Any], make: Callable[[], Any]) -> None:
-        self.pool, self.moves = pool, 0
+    A pickle holds the seed and the actions, and repeats them where it is read.
+    """
+
+    def __init__(
+        self, pool: list[Any], make: Callable[[], Any], seed: int, actions: Sequence[Any] = ()
+    ) -> None:
+        self.pool, self.make, self.seed, self.actions = pool, make, seed, list(actions)
         self.env = pool.pop() if pool else make()
+        self.first, _ = self.env.reset(seed=seed)
+        for action in actions:
+            self.env.step(action)
 
     def __del__(self) -> None:
         if hasattr(self, "env"):
@@ -93,14 +120,14 @@ class Episode:
 
     def move(self, moves: int, action: Any) -> tuple[Any, ...]:
         """Step the environment from its state after ``moves`` moves."""
-        if moves != self.moves:
+        if moves != len(self.actions):
             raise ConfigurationError("the environment has moved on: its states cannot branch")
-        self.moves += 1
+        self.actions.append(action)
         result: tuple[Any, ...] = self.env.step(action)
         return result
 
     def __reduce__(self) -> Any:
-        raise ConfigurationError("a live environment cannot be copied: its states cannot branch")
+        return Episode, ([], self.make, self.seed, self.actions)
 
 
 @dataclass(slots=True)
@@ -120,21 +147,19 @@ class LiveState:
 
 
 class GymnasiumSystem(NonlinearSystem):
-    """An environment, its agent, and the predictor of the entries that are not transmitted.
-
-    ``explained_variance`` (n,) is R² of the predictor's changes in episodes that did not fit it.
-    """
+    """An environment, its agent, and the predictor of the entries that are not transmitted."""
 
     def __init__(self, options: GymnasiumEnvironmentOptions) -> None:
-        self.options, self.pool = options, list[Any]()
         if not isinstance(options.env_kwargs, Mapping | None):
             raise refusal("env_kwargs", options.env_kwargs, "a dictionary of keyword arguments")
-        observations, self.actions = _spaces(options.env_id, env := self.make())
-        self.pool.append(env)
-        self.low, self.high, self.dtype = observations.low, observations.high, observations.dtype
-        size = observations.shape[0]
-        self.indices = _indices(options.sensor_indices, size)
-        self.agent = _agent(options.controller, observations, self.actions)
+        self.make = functools.partial(_make, options.env_id, dict(options.env_kwargs or {}))
+        self.best_reward, env = options.best_reward, self.make()
+        self.pool: list[Any] = [env]
+        check_spaces("env_id", options.env_id, env)
+        self.dtype, self.actions = env.observation_space.dtype, env.action_space
+        size = env.observation_space.shape[0]
+        self.indices = check_indices(options.sensor_indices, size)
+        self.agent = _agent(options.controller, env.observation_space, self.actions)
         zeros = np.zeros(size)
         super().__init__(
             numbered_states(size),
@@ -145,39 +170,27 @@ class GymnasiumSystem(NonlinearSystem):
             initial_covariance=np.diag(zeros),
             inputs=int(np.prod(self.actions.shape)) or 1,
         )
-        self._fit(options.predictor)
+        samples = sample(env, self.control)
+        self.predictor = Predictor(options.predictor, env, samples)
+        self._magnitude = np.sqrt(np.maximum((samples.after**2).mean(1), 1e-12))
+        self._spread = np.maximum(samples.after.var(1), 1e-12)
 
-    def make(self) -> Any:
-        """Return a new environment without a limit of its steps."""
-        options = self.options
-        try:
-            return gymnasium.make(
-                options.env_id,
-                max_episode_steps=-1,
-                disable_env_checker=True,
-                **(options.env_kwargs or {}),
-            )
-        except Exception as error:  # an environment may raise any exception
-            reason = f"an id that gymnasium.make takes with env_kwargs ({error})"
-            raise refusal("env_id", options.env_id, reason) from error
+    @property
+    def explained_variance(self) -> Array:
+        """R² (n,) of the predicted changes in episodes that did not fit."""
+        return self.predictor.explained_variance
 
     def control(self, mean: Array) -> Array:
         """Return the agent's actions (k, N) on estimates (n, N)."""
-        observations = np.clip(mean.T, self.low, self.high).astype(self.dtype)
-        actions = np.asarray(self.agent(observations), dtype=np.float64)
-        if isinstance(self.actions, spaces.Box):
-            actions = np.clip(actions.reshape(-1, self.inputs), self.actions.low, self.actions.high)
+        actions = np.asarray(self.agent(mean.T.astype(self.dtype)), dtype=np.float64)
         shape = (mean.shape[-1], self.inputs)
         if actions.size != np.prod(shape):
             allowed = f"a function that returns actions of shape {shape[:1]} or {shape}"
             raise ConfigurationError(f"controller is not allowed: it must be {allowed}")
-        return actions.reshape(shape).T
-
-    def action(self, control: Array) -> Any:
-        """Return the environment's action of an input (k,)."""
-        if isinstance(self.actions, spaces.Discrete):
-            return int(control[0])
-        return control.astype(self.actions.dtype)
+        actions = actions.reshape(shape)
+        if isinstance(self.actions, spaces.Box):
+            actions = np.clip(actions, self.actions.low, self.actions.high)
+        return actions.T
 
     def move(self, state: Array, noise: Array) -> Array:
         """Not defined: the environment itself moves."""
@@ -191,11 +204,12 @@ class GymnasiumSystem(NonlinearSystem):
         return result
 
     def predict(self, mean: Array, covariance: Array, control: Array) -> tuple[Array, Array]:  # type: ignore[override]
-        """Return the predictor's estimate within twice the range of the fit, and its covariance."""
-        predicted = np.clip(self._predict(mean, control), *self._limits)
-        moved = linalg.congruence(self._slope, covariance) + self._residual
-        excess = (linalg.diagonal(moved) / self._largest[:, None]).max(0)
-        return predicted, moved / np.maximum(excess, 1.0)
+        """Return the predictor's estimate and its covariance, of at most the range of the fit."""
+        predictor = self.predictor
+        moved = linalg.congruence(predictor.slope[..., None], covariance)
+        moved = moved + predictor.residual[..., None]
+        excess = (linalg.diagonal(moved) / predictor.ranges[:, None] ** 2).max(0)
+        return predictor(mean, control), moved / np.maximum(excess, 1.0)
 
     def update(
         self, mean: Array, covariance: Array, sensor: int, measurement: Array
@@ -203,7 +217,7 @@ class GymnasiumSystem(NonlinearSystem):
         """Take the exact entries of a sensor one after another."""
         for place, entry in enumerate(self.indices[sensor]):
             variance = covariance[entry, entry]
-            known = variance > 1e-14 * self._largest[entry]
+            known = variance > 1e-14 * self.predictor.ranges[entry] ** 2
             gain = np.where(known, covariance[:, entry] / np.where(known, variance, 1.0), 0.0)
             gain[entry] = 1.0
             mean = mean + gain * (measurement[place] - mean[entry])
@@ -216,106 +230,15 @@ class GymnasiumSystem(NonlinearSystem):
         """Root mean square and open-loop error variance (n,) of each entry in the episodes."""
         return self._magnitude, self._spread
 
-    def _fit(self, predictor: Any) -> None:
-        """Run episodes, and fit the predictor and the scales to them."""
-        before, control, after, split = self._sample()
-        change = after - before
-        size = len(before)
-        self._weights: Array | None = None
-        self._function: Function | None = None
-        slope = np.eye(size)
-        if predictor == "linear":
-            regressors = self._regressors(before, control)
-            fit = np.linalg.lstsq(regressors[:, :split].T, change[:, :split].T, rcond=None)
-            self._weights = weights = np.asarray(fit[0].T, dtype=np.float64)
-            slope = slope + weights[:, :size]
-        elif predictor != "hold":
-            named = isinstance(predictor, str)
-            self._function = import_named("predictor", predictor) if named else predictor
-            if not callable(self._function):
-                raise refusal("predictor", predictor, "'hold', 'linear' or a function")
-        residual = (after - self._predict(before, control))[:, split:]
-        total = ((change[:, split:] - change[:, split:].mean(1, keepdims=True)) ** 2).mean(1)
-        error = residual @ residual.T / residual.shape[1]
-        self.explained_variance = 1.0 - np.diag(error) / np.maximum(total, 1e-300)
-        if predictor == "hold":
-            error = np.diag(np.diag(error))
-        low, high = after.min(1), after.max(1)
-        self._limits = (1.5 * low - 0.5 * high)[:, None], (1.5 * high - 0.5 * low)[:, None]
-        self._spread = np.maximum(after.var(1), 1e-12)
-        self._largest = np.maximum((high - low) ** 2, 1e-12)
-        self._magnitude = np.sqrt(np.maximum((after**2).mean(1), 1e-12))
-        self._slope, self._residual = slope[..., None], error[..., None]
 
-    def _predict(self, mean: Array, control: Array) -> Array:
-        """Return the next estimate (n, N)."""
-        if self._function is not None:
-            actions = control.T if self.actions.shape else control[0].astype(np.int64)
-            result = np.asarray(self._function(mean.T, actions), dtype=np.float64).T
-            if result.shape != mean.shape:
-                allowed = f"a function that returns the shape {mean.T.shape}, not {result.T.shape}"
-                raise ConfigurationError(f"predictor is not allowed: it must be {allowed}")
-            return result
-        if self._weights is None:
-            return mean
-        moved: Array = mean + self._weights @ self._regressors(mean, control)
-        return moved
-
-    def _regressors(self, mean: Array, control: Array) -> Array:
-        """Return estimate, action (a discrete one as a unit vector) and 1, (entries, N)."""
-        if isinstance(self.actions, spaces.Discrete):
-            control = 1.0 * (
-                np.arange(int(self.actions.n))[:, None] == control - self.actions.start
-            )
-        return np.vstack((mean, control, np.ones((1, mean.shape[-1]))))
-
-    def _sample(self) -> tuple[Array, Array, Array, int]:
-        """Return observations, inputs and next observations, and the number of those that fit."""
-        generator, steps, split = np.random.default_rng(_SEED), list[Any](), 0
-        for number in range(_EPISODES):
-            split = len(steps) if number == _EPISODES * 3 // 4 else split
-            episode = Episode(self.pool, self.make)
-            seen, _ = episode.env.reset(seed=number)
-            self.actions.seed(number)
-            for moves in range(_STEPS):
-                control = self.control(np.asarray(seen, np.float64)[:, None])[:, 0]
-                if generator.random() < _RANDOM:
-                    control = np.array(self.actions.sample(), np.float64).reshape(-1)
-                following, _, *ends, _ = episode.move(moves, self.action(control))
-                steps.append((seen, control, following))
-                seen = following
-                if any(ends):
-                    break
-        before, control, after = (np.array(part, np.float64).T for part in zip(*steps, strict=True))
-        return before, control, after, split
-
-
-def _spaces(env_id: str, env: Any) -> tuple[spaces.Box, Any]:
-    """Return checked spaces of observations and actions."""
-    observations, actions = env.observation_space, env.action_space
-    if not isinstance(observations, spaces.Box) or len(observations.shape) != 1:
-        allowed = "an environment whose observation is a vector (FlattenObservation makes one)"
-        raise refusal("env_id", env_id, f"{allowed}, not {observations}")
-    if not isinstance(actions, _ACTIONS) or len(actions.shape or ()) > 1:
-        raise refusal("env_id", env_id, f"an environment with numbers as action, not {actions}")
-    return observations, actions
-
-
-def _indices(value: Any, size: int) -> tuple[tuple[int, ...], ...]:
-    """Return the checked entries of each sensor."""
-    allowed = f"a list of entries from 0 to {size - 1} for each sensor, together all of them"
+def _make(env_id: str, env_kwargs: dict[str, Any]) -> Any:
+    """Return a new environment without a limit of its steps and without wrappers that check."""
     try:
-        result = tuple(tuple(int(entry) for entry in entries) for entries in value)
-        exact = all(
-            a == b for s, t in zip(result, value, strict=True) for a, b in zip(s, t, strict=True)
-        )
-    except (TypeError, ValueError):
-        raise refusal("sensor_indices", value, allowed) from None
-    every = [entry for entries in result for entry in entries]
-    whole = set(every) == set(range(size)) and all(result)
-    if not (exact and whole and all(len(set(s)) == len(s) for s in result)):
-        raise refusal("sensor_indices", value, allowed)
-    return result
+        env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **env_kwargs)
+    except Exception as error:  # an environment may raise any exception
+        reason = f"an id that gymnasium.make takes with env_kwargs ({error})"
+        raise refusal("env_id", env_id, reason) from error
+    return env.env if isinstance(env, gymnasium.wrappers.OrderEnforcing) else env
 
 
 def _agent(controller: Any, observations: spaces.Box, actions: Any) -> Function:
@@ -355,18 +278,18 @@ class GymnasiumPlant(Plant[LiveState]):
     def start(self, noise: Array) -> tuple[LiveState, None]:
         """Reset the environments, with seeds from the noise."""
         runs = noise.shape[-1]
-        episodes = np.empty(runs, dtype=object)
-        episodes[:] = [Episode(self.system.pool, self.system.make) for _ in range(runs)]
         seeds = np.ascontiguousarray(noise[0]).view(np.uint64) >> np.uint64(21)
-        seen = [e.env.reset(seed=int(seed))[0] for e, seed in zip(episodes, seeds, strict=True)]
-        return self._state(np.array(seen, np.float64).T, np.zeros(runs), episodes, 0), None
+        pool, make, episodes = self.system.pool, self.system.make, np.empty(runs, dtype=object)
+        episodes[:] = [Episode(pool, make, seed) for seed in seeds.tolist()]
+        first = np.array([episode.first for episode in episodes], np.float64)
+        return self._state(first.T, np.zeros(runs), episodes, 0), None
 
     def sense(self, state: LiveState, noise: Array, control: Array) -> LiveState:  # type: ignore[override]
         """Step the environments that have not ended."""
         truth, loss, over = state.truth.copy(), np.zeros(len(state.loss)), state.over.copy()
-        best = self.system.options.best_reward
+        best, actions = self.system.best_reward, self.system.actions
         for run in np.flatnonzero(~over).tolist():
-            episode, action = state.episodes[run], self.system.action(control[:, run])
+            episode, action = state.episodes[run], action_of(actions, control[:, run])
             seen, reward, *ends, _ = episode.move(int(state.moves[run]), action)
             truth[:, run], loss[run], over[run] = seen, best - float(reward), any(ends)
         if not np.all(loss >= 0.0):
@@ -440,7 +363,7 @@ class AgentController(Controller):
 
     def forfeit(self, state: LiveState) -> Array:
         """Return the best reward."""
-        return np.full(len(state.loss), self.system.options.best_reward)
+        return np.full(len(state.loss), self.system.best_reward)
 
 
 def build_gymnasium(options: GymnasiumEnvironmentOptions) -> Scenario:

@@ -117,10 +117,24 @@ def test_live_environments_cannot_go_back() -> None:
     batch.step(every)
     refused(lambda: batch.task.plant.sense(state, np.zeros((0, 2)), np.zeros((1, 2))), "branch")
     refused(batch.branch, "its states cannot branch")
-    refused(lambda: pickle.dumps(batch.state), "its states cannot branch")
     with pytest.warns(UserWarning, match="GymnasiumPlant"):
         EpisodeBatch.seeded(task_of(backend="compiled"), 1, 0)
     refused(lambda: fusion_gym.make_policy("rollout:base=always", task_of()), "GymnasiumPlant")
+
+
+def test_a_copy_repeats_the_actions() -> None:
+    """A checkpoint, or a worker process, continues the same episodes."""
+    batch = EpisodeBatch.seeded(task_of(**SWING, controller=swing), 3, 0)
+    every = np.ones((2, 3), bool)
+    for _ in range(20):
+        batch.step(every)
+    state = batch.state.plant
+    copied = pickle.loads(pickle.dumps(state))
+    noise, control = np.zeros((0, 3)), np.array([[1.0, -2.0, 0.5]])
+    rows = [batch.task.plant.sense(each, noise, control) for each in (copied, state)]
+    np.testing.assert_array_equal(rows[0].truth, rows[1].truth)
+    np.testing.assert_array_equal(rows[0].loss, rows[1].loss)
+    assert np.ptp(rows[0].truth, axis=1).all()
 
 
 class Wordy(gymnasium.Env[Any, Any]):

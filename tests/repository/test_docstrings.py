@@ -12,7 +12,7 @@ from paths import ROOT
 
 import fusion_gym
 from docs.tables import task_of
-from fusion_gym import evaluation, recordings
+from fusion_gym import evaluation, recordings, wrappers
 from fusion_gym.core.task import CommonOptions
 from fusion_gym.docstrings import read
 from fusion_gym.envs import registration
@@ -58,9 +58,10 @@ NAMES = sorted(REFERENCE)
 
 
 def test_the_reference_has_every_public_name() -> None:
-    modules = {"evaluation", "jax", "zoo"}
+    modules = {"evaluation", "jax", "wrappers", "zoo"}
     names = {f"fusion_gym.{name}" for name in {*fusion_gym.__all__} - modules - {"__version__"}}
     names |= {f"fusion_gym.evaluation.{name}" for name in evaluation.__all__}
+    names |= {f"fusion_gym.wrappers.{name}" for name in wrappers.__all__}
     names |= paths([options_of(env_id) for env_id in ENVIRONMENTS])
     assert names <= REFERENCE
 

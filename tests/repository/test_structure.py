@@ -18,7 +18,7 @@ ROWS = (
     "core",
     "systems",
     "envs solvers zoo",
-    "jax policies",
+    "jax policies wrappers",
     "evaluation configs",
     "output",
     "training recordings",
