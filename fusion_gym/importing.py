@@ -16,7 +16,7 @@ from fusion_gym.errors import forbidden
 from fusion_gym.validation import ConfigurationError, nested
 
 TRUST: ContextVar[bool] = ContextVar("trust", default=False)
-_ENVIRONMENTS = ("env", "env_id", "environment", "error", "id")  # keys whose values with a colon name code
+_ENVIRONMENTS = ("env", "env_id", "environment", "error", "id")  # their values name code with ":"
 _POLICY = re.compile(r"(?:^|base=)\s*(?!(?:model|zoo):)[^\W\d][\w.]*:\s*[^\W\d]\w*\s*(?::|$)")
 
 

@@ -45,7 +45,7 @@ def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array 
         else:
             raise ConfigurationError(
                 "reward_scale = 'auto' is not allowed here: packets at an even pace leave mean "
-                f"squared errors of {display(error)}; they must be finite, and one must be > 0"
+                f"squared errors of {display(error)}, whose cost {whole:g} must be finite and > 0"
             )
         options = replace(options, reward_scale=factor)
     if _is_auto(options.price_range):
@@ -164,7 +164,8 @@ def _sweep(task: Task) -> tuple[Array, Array]:
     share = _WORK / (task.sensors * len(task.open_loop) ** 2)
     runs = int(np.clip(_RUNS * share, 4, _RUNS))
     ratio, count = (2, 21) if runs > 4 else (4, 9)
-    usual = task.reward.error_weight * nominal_error(task)[1]
+    error, whole = nominal_error(task)
+    usual = task.reward.error_weight * (whole or float(task.reward.diagonal[:, 0] @ error))
     levels = usual / float(task.network.bucket.cost.mean()) * np.geomspace(3e-3, 3e2, count)
     counts = ratio ** np.arange(1 + int(math.log(task.sensors, ratio)))
     least = np.tile(np.repeat(levels, runs), len(counts)) * task.network.bucket.cost
@@ -176,8 +177,8 @@ def _sweep(task: Task) -> tuple[Array, Array]:
         rank = np.argsort(np.argsort(-value, axis=0), axis=0)
         outcome = batch.step((value >= least) & (rank < most))
         total += outcome.cost, -outcome.reward_error
-    spent, error = total.reshape(2, -1, runs).mean(-1) / batch.task.horizon
-    return spent, error
+    spent, left = total.reshape(2, -1, runs).mean(-1) / batch.task.horizon
+    return spent, left
 
 
 def lower_hull(rate: Array, error: Array) -> list[int]:

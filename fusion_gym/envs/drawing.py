@@ -36,7 +36,8 @@ class Film:
 
     A picture shows up to four states with the fused estimate and two claimed standard deviations,
     one row of requests per sensor (granted or denied), the input of a controller, and the tokens
-    if they are limited. The censored range of a state is shaded.
+    if they are limited. The censored range of a state is shaded. A plant's own picture stands
+    beside it.
 
     Args:
         task: The task.
@@ -55,13 +56,16 @@ class Film:
         self._ages = np.zeros(runs, dtype=np.int64)  # steps of each run's episode
         self._state_names = task.plant.state_names[:_MOST_STATES]
         self._figure: Any = None  # created by the first frame
+        self._plant: Any = None  # the plant's present state
 
-    def begin(self, runs: NDArray[np.int64] | None = None) -> None:
+    def begin(self, batch: EpisodeBatch, runs: NDArray[np.int64] | None = None) -> None:
         """Begin a new episode in ``runs``, by default in all."""
+        self._plant = batch.state.plant
         self._ages[slice(None) if runs is None else runs] = 0
 
     def record(self, batch: EpisodeBatch, outcome: Outcome) -> None:
         """Record a step of all runs, before a reset."""
+        self._plant = batch.state.plant
         self._steps.append(_Step(batch.delivered, outcome, batch.tokens))
         self._ages += 1
 
@@ -123,7 +127,9 @@ class Film:
             self._level.set_data(times, [step.tokens[run] for step in steps])
         self._axes[-1].set_xlim(first, first + self._window + 1)
         self._canvas.draw()
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        curves: Frame = np.asarray(self._canvas.buffer_rgba(), np.uint8)[..., :3].copy()
+        own = self.task.plant.picture(self._plant, run)
+        return curves if own is None else _beside(curves, own)
 
     def truth(self, run: int = 0) -> Array:
         """Return the drawn states (shown,) of a run after its last step."""
@@ -215,6 +221,14 @@ class Film:
         self._title = self._figure.text(
             0.1, 1.0 - 4 / height, "", va="top", fontsize=9, parse_math=False
         )
+
+
+def _beside(*pictures: Frame) -> Frame:
+    """Return pictures side by side, on white."""
+    height = max(map(len, pictures))
+    sizes = [((0, height - len(picture)), (0, 0), (0, 0)) for picture in pictures]
+    padded = [np.pad(p, size, constant_values=255) for p, size in zip(pictures, sizes, strict=True)]
+    return np.hstack(padded)
 
 
 class Window:

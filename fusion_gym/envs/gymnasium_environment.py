@@ -309,6 +309,11 @@ class GymnasiumPlant(Plant[LiveState]):
         everything = np.ones(state.truth.shape, dtype=np.bool_)
         return np.tile(~state.over, (self.sensor_count, 1)), everything
 
+    def picture(self, state: LiveState, run: int) -> NDArray[np.uint8] | None:
+        """Return the environment's picture, with ``render_mode`` "rgb_array" in ``env_kwargs``."""
+        env = state.episodes[run].env
+        return np.asarray(env.render()) if env.render_mode == "rgb_array" else None
+
     def open_loop(self, horizon: int) -> Array:
         """Return the variance (n,) of the entries in episodes with transmissions."""
         return self.system.typical[1]

@@ -93,7 +93,7 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
             self.batch.seed(np.zeros(1, dtype=np.int64), [int(entropy)])
         self.batch.reset()
         if self._film is not None:
-            self._film.begin()
+            self._film.begin(self.batch)
             self._show()
         outcome = vector.reset_outcome(self.task, 1).single(0)
         return self.batch.observe()[0], vector.step_infos(outcome)

@@ -157,7 +157,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         """Begin new episodes in ``runs``."""
         self.batch.reset(runs)
         if self._film is not None:
-            self._film.begin(runs)
+            self._film.begin(self.batch, runs)
 
     def _reset_mask(self, options: Arguments | None) -> NDArray[np.bool_]:
         validation.reset_options(options, ["reset_mask"])

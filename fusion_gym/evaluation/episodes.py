@@ -410,7 +410,7 @@ class _Watched:
         self.name, self.cost, self.tokens, self.steps = name, 0.0, 0.0, 0
         self.batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
         self.film = Film(task, 1, steps)
-        self.film.begin()
+        self.film.begin(self.batch)
         self.requests = decide(policy, self.batch, seed)
 
     def step(self) -> None:

@@ -137,6 +137,20 @@ def test_a_copy_repeats_the_actions() -> None:
     assert np.ptp(rows[0].truth, axis=1).all()
 
 
+def test_a_film_shows_the_environment() -> None:
+    task = task_of(env_kwargs={"render_mode": "rgb_array"}, horizon=6)
+    always = {"always": fusion_gym.make_policy("always", task)}
+    frames = list(fusion_gym.evaluation.watch(task, always))
+    (plain,) = fusion_gym.evaluation.watch(task_of(horizon=6), always, steps=1)
+    height, width, _ = plain.shape
+    assert {frame.shape for frame in frames} == {(max(height, 400), width + 600, 3)}
+    own = [frame[:400, width:] for frame in frames]
+    assert (own[0] != own[-1]).any()
+    env: Any = gymnasium.make(ID, render_mode="rgb_array", env_kwargs={"render_mode": "rgb_array"})
+    env.reset(seed=0)
+    assert env.render().shape == frames[0].shape
+
+
 class Wordy(gymnasium.Env[Any, Any]):
     """Its observation is a dictionary."""
 
