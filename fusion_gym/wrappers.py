@@ -13,13 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.envs.predictor import (
-    Predictor,
-    action_of,
-    check_indices,
-    check_spaces,
-    sample,
-)
+from fusion_gym.envs.predictor import Predictor, action_of, check_indices, check_spaces, sample
 from fusion_gym.errors import refusal
 
 __all__ = ["CostlyObservation"]
@@ -42,6 +36,7 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
 
     The reward is the environment's less the prices of the granted requests. ``info`` has ``cost``,
     the granted requests, and ``observation``, the environment's whole observation.
+    ``predictor.explained_variance`` (n,) is R² of the predicted changes in episodes without a fit.
 
     Args:
         env: Environment whose observation is a vector (n,) and whose action is made of numbers.
@@ -98,7 +93,7 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         if token_rate is not None:
             rate = validation.number("token_rate", token_rate, at_least=0.0)
             self._limit = rate, validation.number("token_capacity", token_capacity, at_least=1.0)
-        self._predictor = self._fit(predictor)
+        self.predictor = self._fit(predictor)
         self._own = env.action_space
         self.action_space = _joint(self._own, self._sensors)
         more = self._sensors + (self._limit is not None)
@@ -107,11 +102,6 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
             for bound, end in ((seen.low, 0.0), (seen.high, 1.0))
         )
         self.observation_space = spaces.Box(low, high, dtype=np.float32)
-
-    @property
-    def explained_variance(self) -> Array:
-        """R² (n,) of the predicted changes of each entry, in episodes that did not fit."""
-        return self._predictor.explained_variance
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, whose first observation is free."""
@@ -128,7 +118,7 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         observation, reward, terminated, truncated, info = self.env.step(own)
         if self._limit:
             self._tokens = min(self._tokens + self._limit[0], self._limit[1])
-        predicted = self._predictor(np.array([self._estimate]).T, control[:, None])
+        predicted = self.predictor(np.array([self._estimate]).T, control[:, None])
         self._estimate, seen = predicted[:, 0].tolist(), observation.tolist()
         for sensor, request in enumerate(requests):
             granted = request > 0 and (self._limit is None or self._tokens >= 1.0 - _ROUNDING)

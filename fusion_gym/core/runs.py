@@ -23,6 +23,7 @@ from fusion_gym.core.network import Delivery, NetworkState
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
+from fusion_gym.errors import ConfigurationError
 from fusion_gym.namespace import namespace
 
 
@@ -228,7 +229,9 @@ class Runs:
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
         """Return independent copies of ``runs``, possibly repeated, by default of all."""
-        self.task.refuse_branches("in alternatives")
+        if not self.task.plant.branches:
+            name = type(self.task.plant).__name__
+            raise ConfigurationError(f"{name} is not allowed here: its states cannot branch")
         memory = self.memory.branch(runs, len(self.steps))
         return Branch(self.task, memory, self.layout, self.position(runs))
 

@@ -362,12 +362,6 @@ class Task(Scenario):
         if self.delayed:
             raise forbidden("delay", self.options.delay, reason, where)
 
-    def refuse_branches(self, where: str) -> None:
-        """Raise an error with the place if the plant's states cannot branch."""
-        if not self.plant.branches:
-            name = type(self.plant).__name__
-            raise ConfigurationError(f"{name} is not allowed {where}: its states cannot branch")
-
     def refuse_control(self, where: str) -> None:
         """Raise an error with the place if a controller closes the loop."""
         if self.controller is not None:

@@ -20,14 +20,7 @@ from fusion_gym.core.plant import Plant
 from fusion_gym.core.task import CommonOptions, Scenario
 from fusion_gym.core.token_bucket import Tokens
 from fusion_gym.declaration import Mark
-from fusion_gym.envs.predictor import (
-    Predict,
-    Predictor,
-    action_of,
-    check_indices,
-    check_spaces,
-    sample,
-)
+from fusion_gym.envs.predictor import Predictor, action_of, check_indices, check_spaces, sample
 from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.importing import import_named
 from fusion_gym.systems.bases import numbered_states
@@ -71,7 +64,7 @@ class GymnasiumEnvironmentOptions(CommonOptions):
         ...     sensor_indices=[[0, 1], [2]],
         ...     best_reward=0.0,
         ... )
-        >>> task.plant.system.explained_variance.shape
+        >>> task.plant.system.predictor.explained_variance.shape
         (3,)
     """
 
@@ -86,7 +79,7 @@ class GymnasiumEnvironmentOptions(CommonOptions):
     deterministic."""
     sensor_indices: Sequence[Sequence[int]] = ((0, 1), (2, 3))
     """Entries of the observation that each sensor measures; together all entries."""
-    predictor: Predict = "hold"
+    predictor: str | Callable[[Array, Any], Any] = "hold"
     """Estimate of the entries that are not transmitted: ``"hold"`` keeps them, ``"linear"`` fits
     the next observation to observation and action, or a function from estimates (N, n) and actions
     to next estimates (N, n), or its ``"module:name"``."""
@@ -172,13 +165,9 @@ class GymnasiumSystem(NonlinearSystem):
         )
         samples = sample(env, self.control)
         self.predictor = Predictor(options.predictor, env, samples)
-        self._magnitude = np.sqrt(np.maximum((samples.after**2).mean(1), 1e-12))
-        self._spread = np.maximum(samples.after.var(1), 1e-12)
-
-    @property
-    def explained_variance(self) -> Array:
-        """R² (n,) of the predicted changes in episodes that did not fit."""
-        return self.predictor.explained_variance
+        moments = (samples.after**2).mean(1), samples.after.var(1)
+        magnitude, variance = np.maximum(moments, 1e-12)
+        self.typical = np.sqrt(magnitude), variance
 
     def control(self, mean: Array) -> Array:
         """Return the agent's actions (k, N) on estimates (n, N)."""
@@ -224,11 +213,6 @@ class GymnasiumSystem(NonlinearSystem):
             covariance = covariance - linalg.outer(gain, covariance[entry])
             covariance[entry] = covariance[:, entry] = 0.0
         return mean, covariance
-
-    @functools.cached_property
-    def typical(self) -> tuple[Array, Array]:
-        """Root mean square and open-loop error variance (n,) of each entry in the episodes."""
-        return self._magnitude, self._spread
 
 
 def _make(env_id: str, env_kwargs: dict[str, Any]) -> Any:

@@ -16,7 +16,6 @@ _SEED, _EPISODES, _STEPS = 0, 20, 200  # of the episodes of the fit
 _RANDOM = 0.2  # share of their actions that is random
 _RANGES = 5.0  # ranges of the fit by which a linear prediction may depart from its middle
 _ACTIONS = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
-Predict = str | Callable[[Array, Any], Any]
 
 
 class Samples(NamedTuple):
@@ -35,7 +34,9 @@ class Predictor:
     ``slope`` (n, n) and ``residual`` (n, n) are derivative and error covariance of a prediction.
     """
 
-    def __init__(self, predictor: Predict, env: Any, samples: Samples) -> None:
+    def __init__(
+        self, predictor: str | Callable[[Array, Any], Any], env: Any, samples: Samples
+    ) -> None:
         self.weights: Array | None = None
         self.actions = env.action_space
         discrete = isinstance(self.actions, spaces.Discrete)

@@ -99,7 +99,7 @@ def test_a_predictor_carries_the_estimate_through_silence() -> None:
     """CartPole's step is linear, but for its acceleration; the pendulum's is not."""
     linear = task_of(predictor="linear")
     plant: Any = linear.plant
-    assert plant.system.explained_variance.min() > 0.98
+    assert plant.system.predictor.explained_variance.min() > 0.98
     still = task_of(predictor=lambda seen, action: seen + 0.0 * action[:, None])
     errors = [
         run_episodes(task, fusion_gym.make_policy("periodic:period=4", task), 20, 0).mse.mean()
@@ -108,7 +108,7 @@ def test_a_predictor_carries_the_estimate_through_silence() -> None:
     assert errors[1] < 0.01 * errors[0]
     assert errors[2] < errors[0]  # it corrects entries by what others show
     pendulum: Any = task_of(**SWING, controller=swing, predictor="linear").plant
-    assert pendulum.system.explained_variance[0] < 0.7
+    assert pendulum.system.predictor.explained_variance[0] < 0.7
 
 
 def test_live_environments_cannot_go_back() -> None:

@@ -127,8 +127,8 @@ def test_what_is_not_requested_is_held_or_predicted() -> None:
         shown, *_ = lean.step(joint(held, step % 2, [0, 0]))
         pushed = np.minimum(first[lean][:4] + (step + 1) // 2, lean.observation_space.high[:4])
         np.testing.assert_allclose(shown[:4], pushed, rtol=1e-6)
-    assert linear.explained_variance.min() > 0.99
-    assert held.explained_variance.max() < 0.1
+    assert linear.predictor.explained_variance.min() > 0.99
+    assert held.predictor.explained_variance.max() < 0.1
 
 
 def test_a_bucket_pays_for_the_first_sensors() -> None:
