@@ -118,8 +118,8 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         observation, reward, terminated, truncated, info = self.env.step(own)
         if self._limit:
             self._tokens = min(self._tokens + self._limit[0], self._limit[1])
-        predicted = self.predictor(np.array([self._estimate]).T, control[:, None])
-        self._estimate, seen = predicted[:, 0].tolist(), observation.tolist()
+        estimate, seen = np.array([self._estimate]).T, observation.tolist()
+        self._estimate = self.predictor(estimate, control[:, None])[:, 0].tolist()
         for sensor, request in enumerate(requests):
             granted = request > 0 and (self._limit is None or self._tokens >= 1.0 - _ROUNDING)
             self._ages[sensor] = 0.0 if granted else self._ages[sensor] + 1.0

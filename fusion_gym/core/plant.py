@@ -293,15 +293,6 @@ class Plant(ABC, Generic[StateT]):
         """
         return None
 
-    def picture(self, state: StateT, run: int) -> NDArray[np.uint8] | None:
-        """Return a picture (height, width, 3) of a run for films; ``None`` is none.
-
-        Args:
-            state: State after :meth:`sense`.
-            run: Number of the run.
-        """
-        return None
-
     @abstractmethod
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery.

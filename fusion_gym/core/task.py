@@ -132,6 +132,8 @@ class Scenario:
         error: Function of errors and covariances in place of the option ``error``.
         controller: Controller that closes the loop; its ``error_weights`` go before
             ``state_weights``.
+        picture: Function from the plant's state and the number of a run to the plant's own picture
+            (height, width, 3) for films, or to ``None``.
 
     Example:
         >>> import fusion_gym
@@ -155,6 +157,7 @@ class Scenario:
     noise: NoiseSource | None = None
     error: Callable[[Array, Array], Any] | None = None
     controller: Controller | None = None
+    picture: Callable[[Any, int], Any] | None = None
 
 
 # Additional signals that need the sensors' measurements.

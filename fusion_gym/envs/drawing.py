@@ -128,8 +128,9 @@ class Film:
         self._axes[-1].set_xlim(first, first + self._window + 1)
         self._canvas.draw()
         curves: Frame = np.asarray(self._canvas.buffer_rgba(), np.uint8)[..., :3].copy()
-        own = self.task.plant.picture(self._plant, run)
-        return curves if own is None else _beside(curves, own)
+        picture = self.task.picture
+        own = None if picture is None else picture(self._plant, run)
+        return curves if own is None else _join(curves, own)
 
     def truth(self, run: int = 0) -> Array:
         """Return the drawn states (shown,) of a run after its last step."""
@@ -223,7 +224,7 @@ class Film:
         )
 
 
-def _beside(*pictures: Frame) -> Frame:
+def _join(*pictures: Frame) -> Frame:
     """Return pictures side by side, on white."""
     height = max(map(len, pictures))
     sizes = [((0, height - len(picture)), (0, 0), (0, 0)) for picture in pictures]

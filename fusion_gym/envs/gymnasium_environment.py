@@ -359,5 +359,6 @@ def build_gymnasium(options: GymnasiumEnvironmentOptions) -> Scenario:
     """Return the scenario of these options."""
     system = GymnasiumSystem(options)
     weights = 1.0 / (len(system.state_names) * system.typical[1])
-    parts = GymnasiumPlant(system), GymnasiumEstimator(system)
-    return Scenario(options, *parts, weights, controller=AgentController(system))
+    plant, centre = GymnasiumPlant(system), GymnasiumEstimator(system)
+    agent, picture = AgentController(system), plant.picture
+    return Scenario(options, plant, centre, weights, controller=agent, picture=picture)

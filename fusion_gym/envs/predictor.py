@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -141,12 +142,10 @@ def check_indices(value: Any, size: int) -> tuple[tuple[int, ...], ...]:
     """Return the checked entries of each sensor."""
     allowed = f"a list of entries from 0 to {size - 1} for each sensor, together all of them"
     try:
-        entries = [np.asarray(sensor, dtype=np.float64) for sensor in value]
-        result = tuple(tuple(int(entry) for entry in sensor) for sensor in entries)
-    except (TypeError, ValueError, OverflowError):
+        result = tuple(tuple(map(operator.index, sensor)) for sensor in value)
+    except TypeError:
         raise refusal("sensor_indices", value, allowed) from None
-    whole = all(map(np.array_equal, entries, result)) and all(result)
-    once = all(len(set(sensor)) == len(sensor) for sensor in result)
-    if not (whole and once and {e for sensor in result for e in sensor} == set(range(size))):
+    once = all(sensor and len(set(sensor)) == len(sensor) for sensor in result)
+    if not once or {entry for sensor in result for entry in sensor} != set(range(size)):
         raise refusal("sensor_indices", value, allowed)
     return result
