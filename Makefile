@@ -75,6 +75,8 @@ films: $(STAMP)  ## the films of docs/films
 	$(BIN)/fusion-gym watch --env fusion_gym/TobitOscillator-v1 --fps 6 --policy zoo:tobit_oscillator_scheduler,price=0.2 \
 		--against dynamic_event --save docs/films/tobit_oscillator.gif --set horizon=60 filter=tobit random_start=true \
 		token_rate=2.0 memory=true cost_weight=0.2
+	$(WATCH)/GymnasiumEnvironment-v1 --policy send_on_delta:threshold=0.5 --save docs/films/any_environment.gif \
+		--set 'env_kwargs={"render_mode": "rgb_array"}'
 	$(WATCH)/BiasedOscillator-v1 --policy round_robin --save docs/films/biased_oscillator.gif
 	$(WATCH)/BiasedTracking-v1 --policy round_robin --save docs/films/biased_tracking.gif
 	$(WATCH)/CorrelatedTracking-v1 --policy adaptive_innovation --save docs/films/correlated_tracking.gif

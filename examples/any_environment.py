@@ -59,7 +59,7 @@ def heuristic(observations):
     """Gymnasium's controller of LunarLander, for observations (N, 8)."""
     from gymnasium.envs.box2d import lunar_lander
 
-    lander = types.SimpleNamespace(continuous=False)
+    lander = types.SimpleNamespace(unwrapped=types.SimpleNamespace(continuous=False))
     return np.array([lunar_lander.heuristic(lander, seen) for seen in observations])
 
 
@@ -136,14 +136,14 @@ def shaken(predictor, steps):
     )  # fmt: skip
 
 
-def cart_pole(steps: int = 40_000, episodes: int = 200, timesteps: int = 100_000) -> None:
+def cart_pole(steps: int = 40_000, episodes: int = 200, timesteps: int = 300_000) -> None:
     """Compare rules and PPO on the estimate of an agent of Stable-Baselines3."""
     quiet = fusion_gym.make_task(
         ID, controller=agent(steps), predictor="linear", horizon=500, cost_weight=0.0
     )
     print("CartPole-v1, 500 steps, linear predictor")
     compare(
-        quiet, {rule: rule for rule in ("always", "innovation_threshold:threshold=3")}, episodes
+        quiet, {rule: rule for rule in ("always", "innovation_threshold:threshold=0.3")}, episodes
     )
     for predictor in ("hold", "linear"):
         task = shaken(predictor, steps)
@@ -158,7 +158,15 @@ def learn(task, name, timesteps):
     """Train PPO to transmit."""
     experiment = {
         "environment": {"id": ID, "options": {**task.settings}},
-        "algorithm": {"name": "ppo", "n_steps": 32, "batch_size": 1024, "gamma": 0.97},
+        "algorithm": {
+            "name": "ppo",
+            "learning_rate": 0.002,
+            "learning_rate_end": 1e-5,
+            "n_steps": 32,
+            "batch_size": 2048,
+            "gamma": 0.97,
+            "initial_rate": 0.1,
+        },
         "training": {"timesteps": timesteps, "num_envs": 64},
         "validation": {"every": timesteps // 4, "episodes": 32},
         "output": str(FOLDER / name),

@@ -18,6 +18,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.gymnasium_environment import balance
 from fusion_gym.evaluation import run_episodes
+from fusion_gym.importing import refuse_code
 
 ID = "fusion_gym/GymnasiumEnvironment-v1"
 SWING: dict[str, Any] = {
@@ -111,6 +112,13 @@ def test_a_predictor_carries_the_estimate_through_silence() -> None:
     assert pendulum.system.predictor.explained_variance[0] < 0.7
 
 
+def test_a_file_that_names_code_needs_trust() -> None:
+    codes = {"env_id": "antigravity:CartPole-v1", "controller": "antigravity:act"}
+    for name, value in codes.items():
+        refused(lambda: refuse_code({"options": {name: value}}, "plan.yaml"), name, "--trust")  # noqa: B023
+    refuse_code({"env_id": "CartPole-v1", "controller": "model:agent.zip"}, "plan.yaml")
+
+
 def test_live_environments_cannot_go_back() -> None:
     batch = EpisodeBatch.seeded(task_of(), 2, 0)
     state, every = batch.state.plant, np.ones((2, 2), bool)
@@ -135,6 +143,35 @@ def test_a_copy_repeats_the_actions() -> None:
     np.testing.assert_array_equal(rows[0].truth, rows[1].truth)
     np.testing.assert_array_equal(rows[0].loss, rows[1].loss)
     assert np.ptp(rows[0].truth, axis=1).all()
+
+
+def test_the_lander_lands_under_its_own_controller() -> None:
+    pytest.importorskip("Box2D")
+    from examples.any_environment import heuristic
+
+    sensors = [[0, 1], [2, 3], [4, 5], [6, 7]]
+    task = task_of(
+        env_id="LunarLander-v3", controller=heuristic, sensor_indices=sensors, best_reward=100.0,
+        horizon=300, predictor="linear",
+    )  # fmt: skip
+    results = run_episodes(task, fusion_gym.make_policy("always", task), 2, seed=3)
+    expected = [100.0 - own_return(task, 3 + i, heuristic) / 300 for i in range(2)]
+    np.testing.assert_allclose(results.control_cost, expected, atol=1e-9)
+    assert min(expected) < 100.0 - 150.0 / 300
+
+
+@pytest.mark.slow
+def test_the_example_prints_its_rows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from examples import any_environment
+
+    monkeypatch.setattr(any_environment, "FOLDER", tmp_path)
+    any_environment.cart_pole(steps=2_048, episodes=4, timesteps=8_192)
+    any_environment.joint(timesteps=1_024, steps=2_048, episodes=4)
+    rows = capsys.readouterr().out.splitlines()
+    for policy, count in {"always": 4, "periods": 3, "send_on_delta": 3, "PPO": 3}.items():
+        assert len([row for row in rows if row.startswith(policy)]) == count
 
 
 def test_a_film_shows_the_environment() -> None:
