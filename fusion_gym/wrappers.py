@@ -96,9 +96,8 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         self.predictor = self._fit(predictor)
         self._own = env.action_space
         self.action_space = _joint(self._own, self._sensors)
-        more = self._sensors + (self._limit is not None)
         low, high = (
-            np.concatenate([bound, np.full(more, end)]).astype(np.float32)
+            np.append(bound, [end] * (self._sensors + bool(self._limit))).astype(np.float32)
             for bound, end in ((seen.low, 0.0), (seen.high, 1.0))
         )
         self.observation_space = spaces.Box(low, high, dtype=np.float32)
@@ -114,8 +113,8 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         """Move the environment, and deliver what is requested of its observation."""
         joint, price, cost = np.asarray(action), 0.0, 0.0
         control, requests = joint[: -self._sensors], joint[-self._sensors :].tolist()
-        own = action_of(self._own, control)
-        observation, reward, terminated, truncated, info = self.env.step(own)
+        result = self.env.step(action_of(self._own, control))
+        observation, reward, terminated, truncated, info = result
         if self._limit:
             self._tokens = min(self._tokens + self._limit[0], self._limit[1])
         estimate, seen = np.array([self._estimate]).T, observation.tolist()
@@ -134,16 +133,15 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
     def _observe(self) -> NDArray[np.float32]:
         """Return estimate, ages and tokens."""
         tokens = [self._tokens / self._limit[1]] if self._limit else []
-        ages = [age / (age + _AGE) for age in self._ages]
-        return np.array([*self._estimate, *ages, *tokens], np.float32)
+        rows = *self._estimate, *(age / (age + _AGE) for age in self._ages), *tokens
+        return np.array(rows, np.float32)
 
     def _fit(self, predictor: Any) -> Predictor:
         """Return the predictor, fitted to episodes of another copy of the environment."""
         if self.env.spec is None:
             raise refusal("env", self.env, "an environment of gymnasium.make, which can be copied")
-        copy = gymnasium.make(self.env.spec)
-        samples = sample(copy)
-        copy.close()
+        with gymnasium.make(self.env.spec) as copy:
+            samples = sample(copy)
         return Predictor(predictor, self.env, samples)
 
 

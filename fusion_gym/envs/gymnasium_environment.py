@@ -225,7 +225,7 @@ def _make(env_id: str, env_kwargs: dict[str, Any]) -> Any:
     return env.env if isinstance(env, gymnasium.wrappers.OrderEnforcing) else env
 
 
-def _agent(controller: Any, observations: spaces.Box, actions: Any) -> Function:
+def _agent(controller: Any, observations: spaces.Box, actions: Any) -> Any:
     """Return the agent as a function from observations (N, n) to actions."""
     if isinstance(controller, str):
         if controller.startswith("model:"):
@@ -235,8 +235,7 @@ def _agent(controller: Any, observations: spaces.Box, actions: Any) -> Function:
         controller = import_named("controller", controller)
     if not callable(controller):
         raise refusal("controller", controller, "a saved agent or a function")
-    function: Function = controller
-    return function
+    return controller
 
 
 def _predicted(model: Any, observations: Array) -> Any:

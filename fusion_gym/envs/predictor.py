@@ -118,9 +118,8 @@ def sample(env: Any, act: Callable[[Array], Array] | None = None) -> Samples:
             before = after
             if any(ends):
                 break
-    moves = (np.array(part, np.float64).T for part in zip(*steps, strict=True))
-    before, control, after = moves
-    return Samples(before, control, after, fitted)
+    moves = [np.array(part, np.float64).T for part in zip(*steps, strict=True)]
+    return Samples(moves[0], moves[1], moves[2], fitted)
 
 
 def action_of(space: spaces.Space[Any], control: Array) -> Any:

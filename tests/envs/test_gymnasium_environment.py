@@ -170,7 +170,7 @@ def test_the_example_prints_its_rows(
     any_environment.cart_pole(steps=2_048, episodes=4, timesteps=8_192)
     any_environment.joint(timesteps=1_024, steps=2_048, episodes=4)
     rows = capsys.readouterr().out.splitlines()
-    for policy, count in {"always": 4, "periods": 3, "send_on_delta": 3, "PPO": 3}.items():
+    for policy, count in {"always": 4, "periods": 3, "innovation_threshold": 4, "PPO": 3}.items():
         assert len([row for row in rows if row.startswith(policy)]) == count
 
 
