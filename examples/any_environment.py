@@ -175,7 +175,7 @@ def learn(task, name, timesteps):
     return f"model:{FOLDER / name}/best_model.zip"
 
 
-def lunar_lander(episodes: int = 100) -> None:
+def lunar_lander(episodes: int = 40) -> None:
     """Compare rules on the estimate of Gymnasium's controller of LunarLander."""
     task = fusion_gym.make_task(
         ID, env_id="LunarLander-v3", controller=heuristic, predictor="linear", horizon=400,
