@@ -127,7 +127,7 @@ class CostlyObservation(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
                 for entry in self._entries[sensor]:
                     self._estimate[entry] = seen[entry]
                 self._tokens -= 1.0
-        info |= {"cost": cost, "observation": observation}
+        info = info | {"cost": cost, "observation": observation}
         return self._observe(), float(reward) - price, terminated, truncated, info
 
     def _observe(self) -> NDArray[np.float32]:

@@ -26,8 +26,6 @@ from fusion_gym.importing import import_named
 from fusion_gym.systems.bases import numbered_states
 from fusion_gym.systems.nonlinear import FilteredEstimate, NonlinearEstimator, NonlinearSystem
 
-Function = Callable[..., Any]
-
 
 def balance(observations: Array) -> NDArray[np.int64]:
     """Push the cart of CartPole-v1 (N, 4) to the side to which its pole falls."""
