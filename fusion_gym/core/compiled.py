@@ -66,7 +66,8 @@ class RowStep:
         errors: Any = np.zeros((len(plant.state_names), 1))
         observation = np.zeros((len(layout.names), 1), np.float32)
         self.inputs = arrays_of(self.template)
-        outcome = [*[number] * 4, *[flags] * 3, errors, errors, *[flags[0]] * 2]
+        ages: Any = np.zeros((task.sensors, 1))
+        outcome = [*[number] * 4, *[flags] * 3, errors, errors, *[flags[0]] * 2, ages, number]
         if state.control is not None:
             outcome += [number, state.control]
         self.results = [*outcome, *arrays_of(self._delivered)]

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_gym import linalg
 from fusion_gym.arrays import Array, merge_runs, take_runs, value_of
 from fusion_gym.core.access import discrepancy, place_of
 from fusion_gym.core.control import control_of, inputs_of, over_of
@@ -44,6 +45,10 @@ class Outcome(NamedTuple):
         diverged: (N,) bool, whether a squared error is not finite or exceeds the task's
             ``divergence_level``.
         ended: (N,) bool, whether the episode is over.
+        age: Age of information (sensors, N): steps since the measurement of the newest packet that
+            counts in this step's error.
+        incorrect_age: Age of incorrect information (N,): steps since the weighted squared error
+            was last at most 1.
         control_cost: Cost of state and input (N,), with a controller.
         control: Input (k, N) that acts until the next sensing, with a controller.
         terminated: (N,) bool, whether the controller ends the episode, for one that may.
@@ -60,6 +65,8 @@ class Outcome(NamedTuple):
     squared_error: Array
     diverged: NDArray[np.bool_]
     ended: NDArray[np.bool_]
+    age: Array
+    incorrect_age: Array
     control_cost: Array | None = None
     control: Array | None = None
     terminated: NDArray[np.bool_] | None = None
@@ -76,6 +83,8 @@ class State(NamedTuple):
         plant: The plant's state.
         estimate: The estimator's state after observing.
         network: The network's state before the requests.
+        age: Age of information (sensors, N) after the last delivery.
+        incorrect_age: Age of incorrect information (N,) after it.
         supposed: The estimator's state by the packets that the sensors suppose to have arrived;
             ``None`` if they know.
         history: For late packets, the estimator's state before the update, the measurements, the
@@ -87,6 +96,8 @@ class State(NamedTuple):
     plant: Any
     estimate: Any
     network: NetworkState
+    age: Array
+    incorrect_age: Array
     supposed: Any = None
     history: tuple[tuple[Any, Array, NDArray[np.bool_], Array | None], ...] = ()
     known: NDArray[np.bool_] | None = None
@@ -164,7 +175,6 @@ class Runs:
         network, delivery = task.network.deliver(state.network, requests, silence)
         after = receive(task, state, network, delivery, self.beliefs)
         self.memory.update(self.beliefs, delivery.known)
-        self._delivered = after
         estimator, estimate, spent = task.estimator, after.estimate, delivery.spent
         truth = task.plant.truth(state.plant)
         error, over = truth - estimator.mean(estimate), over_of(task, state.plant)
@@ -176,13 +186,18 @@ class Runs:
         error_term, token_term = task.reward.terms(error, covariance, spent, self.price)
         arrived, late = delivery.reception.arrived, task.network.late(network)
         arrived = arrived if late is None else arrived | late.any(0)
+        age = namespace(error).where(delivery.reception.arrived, 0.0, state.age + 1.0)
+        correct = linalg.weighted_square(error, task.reward.state_weights) <= 1.0
+        incorrect_age = namespace(error).where(correct, 0.0, state.incorrect_age + 1.0)
+        self._delivered = after._replace(age=_with_late(age, late), incorrect_age=incorrect_age)
         diverged = namespace(square).logical_not(square <= task.divergence_level).any(0)
         self.steps = self.steps + 1
         error_term, cost = self._close_loop(error_term, state.plant, after.control, over)
         flags, total = (requested, delivery.granted, arrived), error_term + token_term
         terms = total, error_term, token_term, spent
-        last: Any = diverged, self.steps >= self.limit, cost, after.control, over
-        return Outcome(*terms, *flags, error, square, *last)
+        ends: Any = diverged, self.steps >= self.limit, age, incorrect_age
+        last: Any = cost, after.control, over
+        return Outcome(*terms, *flags, error, square, *ends, *last)
 
     def _close_loop(
         self, error_term: Array, plant: Any, control: Array | None, over: Any
@@ -386,7 +401,10 @@ def start_of(task: Task, noise: Array) -> tuple[State, Any]:
     plant, announcement = task.plant.start(noise[:own])
     estimate = task.estimator.start(task.plant.measurement(plant), announcement)
     supposed = None if task.network.acknowledgement == 1.0 else estimate
-    state = State(plant, estimate, task.network.start(noise[own:]), supposed)
+    network, runs = task.network.start(noise[own:]), noise.shape[1]
+    state = State(
+        plant, estimate, network, np.zeros((task.sensors, runs)), np.zeros(runs), supposed
+    )
     return state._replace(control=control_of(task, plant, estimate)), announcement
 
 
@@ -410,7 +428,8 @@ def advance(task: Task, state: State, noise: Array, steps: NDArray[np.int64]) ->
     readings, known = task.plant.available(plant) or (None, None)
     network = task.network.advance(state.network, noise[own:], steps, readings)
     network = rank_requests(task, network, estimate if supposed is None else supposed)
-    return State(plant, estimate, network, supposed, state.history, known, state.control)
+    moved = state._replace(plant=plant, estimate=estimate, network=network, supposed=supposed)
+    return moved._replace(known=known)
 
 
 def rank_requests(task: Task, state: NetworkState, known: Any) -> NetworkState:
@@ -448,7 +467,17 @@ def receive(
     if task.delayed:
         last = state.estimate, task.plant.measurement(state.plant), arrived, control
         history = (*history, last)[1 - len(task.network.delay) :]
-    return State(state.plant, estimate, network, supposed, history, state.known, control)
+    after = state._replace(estimate=estimate, network=network, supposed=supposed)
+    return after._replace(history=history, control=control)
+
+
+def _with_late(age: Array, late: NDArray[np.bool_] | None) -> Array:
+    """Return the ages (sensors, N) with packets of 1, …, D steps back that arrive next (D, …)."""
+    if late is None:
+        return age
+    steps, xp = np.arange(float(len(late)))[:, None, None], namespace(age, late)
+    result: Array = xp.minimum(age, xp.where(late, steps, np.inf).min(0))
+    return result
 
 
 def settle(task: Task, state: State) -> State:

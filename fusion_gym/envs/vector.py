@@ -308,6 +308,8 @@ def step_infos(outcome: Outcome) -> Infos:
         "denied": (outcome.requested > outcome.granted).T,
         "squared_error": outcome.squared_error.T,
         "diverged": outcome.diverged[...],
+        "age": outcome.age.T,
+        "incorrect_age": outcome.incorrect_age,
     } | {key: value.T for key, value in loop.items() if value is not None}
 
 
@@ -316,7 +318,8 @@ def reset_outcome(task: Task, num_envs: int) -> Outcome:
     none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
     silence = np.zeros((task.sensors, num_envs), dtype=np.bool_)
     error = np.zeros((len(task.plant.state_names), num_envs))
-    terms = none, none, none, none, silence, silence, silence, error, error, never, never
+    age = np.zeros((task.sensors, num_envs))
+    terms = none, none, none, none, silence, silence, silence, error, error, never, never, age, none
     if task.controller is None:
         return Outcome(*terms)
     return Outcome(*terms, none, 0.0 * task.controller.act(error))

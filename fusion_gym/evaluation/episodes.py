@@ -47,6 +47,14 @@ class EpisodeResults:
         diverged: share of diverged steps (E,).
         squared_error: squared error (H, n) at each time and state, averaged over the episodes that
             are not lost by then.
+        age: age of information (E, sensors), steps since the measurement of the newest packet that
+            has arrived (S. Kaul, R. Yates and M. Gruteser, "Real-time status: how often should one
+            update?", IEEE INFOCOM 2012).
+        peak_age: mean age of information just before an arrival (E, sensors); NaN without one.
+        age_95: 95 % quantile of the age of information (E, sensors).
+        incorrect_age: age of incorrect information (E,), steps since the weighted squared error was
+            last at most 1 (A. Maatouk, S. Kriouile, M. Assaad and A. Ephremides, "The age of
+            incorrect information", IEEE/ACM Trans. Networking 28, 2020).
         control_cost: cost of state and input (E,), with a controller; a step that the plant ends
             is charged for each forfeited step, whose errors count as zero.
         control: squared input (E, k), with a controller.
@@ -71,6 +79,10 @@ class EpisodeResults:
     returns: Array
     diverged: Array
     squared_error: Array
+    age: Array
+    peak_age: Array
+    age_95: Array
+    incorrect_age: Array
     control_cost: Array | None = None
     control: Array | None = None
 
@@ -221,6 +233,8 @@ _MEANS: dict[str, Callable[[_Step], NDArray[Any]]] = {
     "tokens": lambda step: step.outcome.cost,
     "denied": lambda step: (step.outcome.requested & ~step.outcome.granted).sum(0),
     "diverged": lambda step: step.outcome.diverged,
+    "age": lambda step: step.outcome.age,
+    "incorrect_age": lambda step: step.outcome.incorrect_age,
 }
 _OF_CONTROL: dict[str, Callable[[_Step], NDArray[Any]]] = {
     "control_cost": lambda step: cast(Array, step.outcome.control_cost),
@@ -237,7 +251,7 @@ def _results(
     functions = _MEANS if task.controller is None else _MEANS | _OF_CONTROL
     means: dict[str, Any] = dict.fromkeys(functions, 0.0)
     rate, requests = np.zeros((sensors, runs)), np.zeros((sensors, runs))
-    returns, squared_error = np.zeros(runs), []
+    returns, squared_error, ages = np.zeros(runs), [], [np.zeros((sensors, runs))]
     batch.nonfinite = lost = np.zeros(runs, dtype=np.bool_)
     for request in decide(policy, batch, seed):
         outcome = batch.step(request)
@@ -250,10 +264,12 @@ def _results(
         rate += outcome.granted
         requests += outcome.requested
         returns += outcome.reward
+        ages.append(outcome.age)
         if progress is not None:
             progress(runs)
     values = {name: total.T / horizon for name, total in means.items()}
     values |= {"rate": (rate / horizon).T, "requests": (requests / horizon).T, "returns": returns}
+    values |= {name: value.T.copy() for name, value in _age_statistics(np.array(ages)).items()}
     for value in values.values():
         value[lost] = np.nan
     paths = np.moveaxis(np.array(squared_error), -1, 0)
@@ -264,6 +280,15 @@ def _results(
         )
         for first, path in zip(range(0, runs, episodes), paths, strict=True)
     ]
+
+
+def _age_statistics(ages: Array) -> dict[str, Array]:
+    """Return mean peak and 95 % quantile (sensors, N) of ages (H + 1, sensors, N) from time 0."""
+    before, after = ages[:-1], ages[1:]
+    fell = after <= before
+    arrivals = fell.sum(0)
+    peak = np.where(fell, before + 1.0, 0.0).sum(0) / np.where(arrivals, arrivals, np.nan)
+    return {"peak_age": peak, "age_95": np.quantile(after, 0.95, axis=0)}
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,11 @@ class Metric(NamedTuple):
     def summary(self, name: str, results: EpisodeResults) -> Any:
         """Return the metric's interval, or its means along its axis."""
         result = self.samples(results) if self.samples else getattr(results, name)
-        return np.nanmean(result, 0).tolist() if self.axis else mean_interval(result)._asdict()
+        if not self.axis:
+            return mean_interval(result)._asdict()
+        with warnings.catch_warnings():  # a sensor whose packets never arrive has no peak age
+            warnings.filterwarnings("ignore", "Mean of empty slice", RuntimeWarning)
+            return np.nanmean(result, 0).tolist()
 
 
 METRICS = {
@@ -136,6 +140,12 @@ METRICS = {
     "rate": Metric("transmissions per step", "lower", "sensor", "rate"),
     "requests": Metric("requests per step", axis="sensor", column="requests"),
     "tokens": Metric("tokens spent per step", "lower", column="tokens"),
+    "age": Metric("age of information", "lower", "sensor"),
+    "peak_age": Metric("age of information just before an arrival", "lower", "sensor"),
+    "age_95": Metric("95 % quantile of the age of information", "lower", "sensor"),
+    "incorrect_age": Metric(
+        "age of incorrect information: steps since the weighted squared error was at most 1", "lower"
+    ),
     "denied": Metric("requests denied per step", "lower", column="denied"),
     "return": Metric(
         "sum of the rewards of an episode", "higher", column="return", form=".4g", interval=True,

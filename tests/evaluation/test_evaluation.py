@@ -84,7 +84,12 @@ def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
             rows["denied"].append(info["denied"].sum())
             rows["returns"].append(reward)
             rows["diverged"].append(info["diverged"])
+            late = (env.unwrapped.task.reward.state_weights[:, 0] @ info["squared_error"]) > 1.0
+            rows["incorrect_age"].append((rows["incorrect_age"] or [0])[-1] + 1 if late else 0)
         assert len(rows["mse"]) == 12
+        rows["age"], peaks = ages_of(np.array(rows["rate"]))
+        rows["peak_age"] = [[np.mean(own) if own else np.nan for own in peaks]]
+        rows["age_95"] = [np.quantile(rows["age"], 0.95, axis=0)]
         squared_error.append(rows.pop("squared_error"))
         for name, row in rows.items():
             expected = np.sum(row, 0) if name == "returns" else np.mean(row, 0)
@@ -93,6 +98,39 @@ def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
     np.testing.assert_allclose(results.squared_error, np.mean(squared_error, 0), rtol=1e-9)
     np.testing.assert_allclose(results.tokens, results.rate @ [3.0, 2.0, 1.0])
     assert results.episodes == 5
+
+
+def ages_of(granted: Any) -> tuple[list[Any], list[list[int]]]:
+    """Return ages (H, sensors) after grants (H, sensors), and the ages that each grant ended."""
+    last, ages, peaks = [0] * granted.shape[1], [], [[] for _ in granted.T]  # type: ignore[var-annotated]
+    for time, sent in enumerate(granted, 1):
+        for sensor in np.flatnonzero(sent):
+            peaks[sensor].append(time - last[sensor])
+            last[sensor] = time
+        ages.append(time - np.array(last))
+    return ages, peaks
+
+
+@pytest.mark.parametrize("delay", [0, 2, (1, 3)])
+def test_age_of_information_counts_from_the_measurement(delay: Any) -> None:
+    """The age is the time since the latest sending time of the packets that have arrived."""
+    env = gymnasium.make("fusion_gym/LinearFusion-v2", delay=delay, tokens="unlimited")
+    env.action_space.seed(1)
+    env.reset(seed=3)
+    newest, next_newest = np.zeros(2, dtype=int), np.zeros(2, dtype=int)
+    for time in range(1, 60):
+        sleeping = time % 4 > 0
+        *_, info = env.step(np.zeros(2, np.int8) if sleeping else env.action_space.sample())
+        newest = np.maximum(newest, next_newest)
+        if delay == 0:
+            newest[info["granted"]] = time
+        else:
+            late = env.unwrapped.task.network.late(env.unwrapped.batch.delivered.network)
+            for back, sensor, _ in np.argwhere(late):
+                next_newest[sensor] = max(next_newest[sensor], time - back)
+                assert delay != 2 or back == 1
+        np.testing.assert_array_equal(info["age"], time - newest)
+    assert newest.all()
 
 
 def test_results_do_not_depend_on_how_episodes_are_batched(
