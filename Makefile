@@ -77,7 +77,7 @@ films: $(STAMP)  ## the films of docs/films
 		token_rate=2.0 memory=true cost_weight=0.2
 	$(WATCH)/GymnasiumEnvironment-v1 --policy send_on_delta:threshold=0.5 --save docs/films/any_environment.gif \
 		--set 'env_kwargs={"render_mode": "rgb_array"}'
-	$(WATCH)/BiasedOscillator-v1 --policy round_robin --save docs/films/biased_oscillator.gif
+	$(WATCH)/BiasedOscillator-v2 --policy round_robin --save docs/films/biased_oscillator.gif
 	$(WATCH)/BiasedTracking-v1 --policy round_robin --save docs/films/biased_tracking.gif
 	$(WATCH)/CorrelatedTracking-v1 --policy adaptive_innovation --save docs/films/correlated_tracking.gif
 	$(WATCH)/MarkovJumpTracking-v1 --policy local_variance:m=0.9 --save docs/films/markov_jump.gif

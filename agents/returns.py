@@ -2,20 +2,24 @@
 
     python -m agents.returns                         # fusion_gym/envs/returns.csv
 
-The best threshold and the searched rule are tuned at the environment's price, PPO has the lines of
-README. Each policy runs the same 1,000 test episodes. Gymnasium's ``reward_threshold`` is the
-return of the better one of both rules. Finished environments stay in the work folder.
+The best threshold and the searched rule are tuned at the environment's price. PPO has the lines of
+README, and the defaults of Stable-Baselines3. Where SAC sets thresholds, it has the processor time
+of README's PPO. Each policy runs the same 1,000 test episodes. Gymnasium's ``reward_threshold`` is
+the return of the better one of both rules. Finished jobs stay in the work folder.
 """
 
-from collections.abc import Iterator
+import itertools
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.benchmark.jobs import Runner
 from agents.benchmark.rules import COUNT
@@ -28,10 +32,11 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
 from fusion_gym.envs import registration
 from fusion_gym.envs.privileged import make_sb3_vec_env
-from fusion_gym.envs.returns import FILE, ReturnRow
+from fusion_gym.envs.returns import FILE, NAIVE, ReturnRow, read_returns, share_text
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.rule_search import search_of_class, search_rule, try_thresholds
 from fusion_gym.output.files import replacing
+from fusion_gym.output.tables import console, table_tables
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers.silence import cost_bound
@@ -39,17 +44,40 @@ from fusion_gym.validation import ConfigurationError
 
 EPISODES = 1000
 GENERATIONS = 15
-TIMESTEPS = 300_000
+SEEDS = 3
 CLASS: Literal["scheduler"] = "scheduler"  # of an agent without memory
 
 
+class Learner(NamedTuple):
+    """An algorithm, its arguments, its runs and options, and its steps at most."""
+
+    algorithm: type[BaseAlgorithm]
+    arguments: Mapping[str, Any]
+    num_envs: int
+    timesteps: int
+    options: Mapping[str, Any] = {}
+
+
+README, DEFAULTS, THRESHOLDS = "PPO", "PPO, defaults", "SAC, thresholds"
+LEARNERS = {
+    README: Learner(
+        PPO,
+        {"learning_rate": 1e-3, "n_steps": 32, "batch_size": 512, "gamma": 0.95},
+        128,
+        300_000,
+    ),
+    DEFAULTS: Learner(PPO, {"n_steps": 32}, 64, 200_000),
+    THRESHOLDS: Learner(SAC, {"gamma": 0.95}, 16, 10**8, {"action": "threshold"}),
+}
+ON_THRESHOLDS = "fusion_gym/LinearFusion-v2", "fusion_gym/RemoteEstimation-v1"
+
+
 @dataclass(frozen=True)
-class ReturnJob:
-    """All policies in one environment; PPO writes its agent into the folder."""
+class RuleJob:
+    """The rules and the bound of an environment."""
 
     environment: str
-    folder: Path
-    weight: ClassVar[float] = 120.0
+    weight: ClassVar[float] = 60.0
 
     @property
     def inputs(self) -> Plain:
@@ -57,16 +85,29 @@ class ReturnJob:
         return {"environment": self.environment}
 
 
-def run_returns(job: ReturnJob) -> list[ReturnRow]:
-    """Return a row for each policy of an environment, and for the bound of all."""
-    torch.set_num_threads(1)
-    task, rows = registration.make_task(job.environment), []
-    for kind, text, policy in _policies(job, task):
-        results = run_episodes(task, policy, EPISODES, seeds.TEST.start)
-        reach = 1.96 * float(results.returns.std(ddof=1)) / EPISODES**0.5
-        means = (float(item.mean()) for item in (results.mse, results.rate, results.tokens))
-        row = job.environment, kind, text, float(results.returns.mean()), reach, *means
-        rows.append(ReturnRow(*row))
+@dataclass(frozen=True)
+class LearnerJob:
+    """A learner in an environment; ``seconds`` of processor time end it."""
+
+    environment: str
+    kind: str
+    seed: int
+    folder: Path
+    seconds: float = float("inf")
+    weight: ClassVar[float] = 120.0
+
+    @property
+    def inputs(self) -> Plain:
+        """Return the key of the result."""
+        names = "environment", "kind", "seed", "seconds"
+        return {name: getattr(self, name) for name in names}
+
+
+def run_rules(job: RuleJob) -> list[ReturnRow]:
+    """Return a row for each rule of an environment, and for the bound of all."""
+    task = registration.make_task(job.environment)
+    policies = [(kind, text, make_policy(text, task)) for kind, text in _rules(task)]
+    rows = [_row(job.environment, task, *policy) for policy in policies]
     try:
         bound = cost_bound(task, float(task.reward.price.fixed or 0.0)).lower
         rows.append(ReturnRow(job.environment, "bound", "", -task.horizon * bound))
@@ -75,10 +116,37 @@ def run_returns(job: ReturnJob) -> list[ReturnRow]:
     return rows
 
 
-def _policies(job: ReturnJob, task: Task) -> Iterator[tuple[str, str, Policy]]:
-    """Yield kind, text and policy."""
+def run_learner(job: LearnerJob) -> ReturnRow:
+    """Train the learner, write its agent into the folder, and return its row."""
+    torch.set_num_threads(1)
+    learner = LEARNERS[job.kind]
+    envs = make_sb3_vec_env(
+        job.environment, num_envs=learner.num_envs, seed=job.seed, **learner.options
+    )
+    model = learner.algorithm("MlpPolicy", envs, seed=job.seed, **learner.arguments)
+    begin = time.process_time()
+    model.learn(learner.timesteps, lambda *_: time.process_time() < begin + job.seconds)
+    seconds = time.process_time() - begin
+    name = job.environment.rpartition("/")[2], job.kind.replace(", ", "_"), str(job.seed)
+    file = job.folder / "_".join(name)
+    model.save(file)
+    task = registration.make_task(job.environment)
+    policy = make_policy(f"model:{file}", task)
+    row = _row(job.environment, task, job.kind, f"seed={job.seed}", policy)
+    return row._replace(seconds=seconds)
+
+
+def _row(environment: str, task: Task, kind: str, text: str, policy: Policy) -> ReturnRow:
+    results = run_episodes(task, policy, EPISODES, seeds.TEST.start)
+    reach = 1.96 * float(results.returns.std(ddof=1)) / EPISODES**0.5
+    means = (float(item.mean()) for item in (results.mse, results.rate, results.tokens))
+    return ReturnRow(environment, kind, text, float(results.returns.mean()), reach, *means)
+
+
+def _rules(task: Task) -> Iterator[tuple[str, str]]:
+    """Yield kind and text."""
+    yield from ((name, name) for name in NAIVE)
     price = float(task.reward.price.fixed or 0.0)
-    texts = {"random": "random", "always": "always", "never": "never"}
     trials = []
     for rule in load_suite().rules:
         try:
@@ -88,16 +156,9 @@ def _policies(job: ReturnJob, task: Task) -> Iterator[tuple[str, str, Policy]]:
                 trials += try_thresholds(task, rule.policy, values, 96, seeds.TUNING.start)
         except ConfigurationError:  # a rule of another family
             continue
-    texts["best threshold"] = min(trials, key=lambda trial: trial.cost(price)).policy
+    yield "best threshold", min(trials, key=lambda trial: trial.cost(price)).policy
     search = search_of_class(CLASS, task, (max(price, 1e-4),), generations=GENERATIONS)
-    texts["searched rule"] = search_rule(search).policies[0]
-    for kind, text in texts.items():
-        yield kind, text, make_policy(text, task)
-    envs = make_sb3_vec_env(job.environment, num_envs=128, seed=0)
-    model = PPO("MlpPolicy", envs, 1e-3, n_steps=32, batch_size=512, gamma=0.95, seed=0)
-    file = job.folder / job.environment.rpartition("/")[2]
-    model.learn(TIMESTEPS).save(file)
-    yield "PPO", "", make_policy(f"model:{file}", task)
+    yield "searched rule", search_rule(search).policies[0]
 
 
 @dataclass(frozen=True)
@@ -112,12 +173,27 @@ class Returns(Long):
     """Number of parallel processes."""
 
     def run(self) -> None:
-        """Run unfinished environments, and write the table."""
+        """Run unfinished jobs, write the table, and print the shares of the gap."""
         runner = Runner(self.work.absolute(), Pool(self.workers))
-        jobs = [ReturnJob(name, runner.folder) for name in registration.ENVIRONMENTS]
-        rows = [row for own in runner.run(run_returns, jobs, "environments") for row in own]
+        ids = list(registration.ENVIRONMENTS)
+        grid = itertools.product(ids, (README, DEFAULTS), range(SEEDS))
+        own = runner.run(run_learner, [LearnerJob(*key, runner.folder) for key in grid], "PPO")
+        equal = [
+            LearnerJob(row.environment, THRESHOLDS, seed, runner.folder, row.seconds)
+            for seed in range(SEEDS)
+            for row in own
+            if row.environment in ON_THRESHOLDS and row[1:3] == (README, f"seed={seed}")
+        ]
+        own += runner.run(run_learner, equal, "SAC")
+        every = runner.run(run_rules, [RuleJob(name) for name in ids], "rules")
+        rows = [*itertools.chain.from_iterable(every), *own]
+        rows.sort(key=lambda row: ids.index(row.environment))
         with replacing(FILE) as partial:
             pd.DataFrame(rows).to_csv(partial, index=False, float_format="%.5g")
+        read_returns.cache_clear()
+        cells = ([name, *(share_text(name, kind) for kind in LEARNERS)] for name in ids)
+        title = "Share of the gap between naive policies and the best threshold"
+        console().print(table_tables(title, ("environment", *LEARNERS), cells))
 
 
 if __name__ == "__main__":

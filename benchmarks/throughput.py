@@ -42,7 +42,7 @@ RULE = "innovation_threshold:threshold=1.1"
 OPTIONS: tuple[tuple[str, Options], ...] = (
     ("TobitOscillator-v1", {}),
     ("TobitOscillator-v1", {"filter": "tobit"}),
-    ("BiasedOscillator-v1", {"access": "any"}),
+    ("BiasedOscillator-v2", {"access": "any"}),
     ("LinearFusion-v2", {}),
     ("RemoteEstimation-v1", {}),
 )
@@ -53,7 +53,7 @@ OTHERS: tuple[tuple[str, Options], ...] = (
     ("UnknownInput-v1", {}),
     ("UnknownInput-v1", {"filter": "predict"}),
     ("UnknownInput-v1", {"filter": "paper"}),
-    ("BiasedOscillator-v1", {"filter": "adf"}),
+    ("BiasedOscillator-v2", {"filter": "adf"}),
 )
 # A workload takes seconds and returns environment steps per second.
 Workload = Callable[[float], float]

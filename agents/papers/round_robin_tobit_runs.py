@@ -18,7 +18,7 @@ from fusion_gym.systems.tobit.centres import FederatedCentre
 from fusion_gym.systems.tobit.filters import Expectation, TobitKalmanFilter, censored_moments
 from fusion_gym.systems.tobit.system import CensoredEstimator
 
-OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
+OSCILLATOR = "fusion_gym/BiasedOscillator-v2"
 TRACKING = "fusion_gym/BiasedTracking-v1"
 STATES = 3  # x1, x2, b
 PAPER_RUNS = 1000

@@ -13,7 +13,15 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import declaration, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.action import ACTIONS, Action, ActionOptions, Sets, Single
+from fusion_gym.core.action import (
+    ACTIONS,
+    SCORES,
+    Action,
+    ActionOptions,
+    Sets,
+    Single,
+    Threshold,
+)
 from fusion_gym.core.control import Controller
 from fusion_gym.core.estimator import Estimator
 from fusion_gym.core.knowledge import (
@@ -260,8 +268,11 @@ class Task(Scenario):
     @functools.cached_property
     def action(self) -> Action:
         """The scheduler's action."""
-        kind = Single if self.options.access == "single" else ACTIONS[self.options.action]
-        return kind(self.sensors, self.options.channels)
+        options, single = self.options, self.options.access == "single"
+        if options.action == "threshold":
+            return Threshold(self.sensors, SCORES[options.score], self.error_scale, single)
+        kind = Single if single else ACTIONS[options.action]
+        return kind(self.sensors, options.channels)
 
     @functools.cached_property
     def reward(self) -> Reward:
@@ -349,8 +360,11 @@ class Task(Scenario):
     def hidden_signals(self) -> tuple[str, ...]:
         """Names of the signals that the information mode withholds."""
         signals = self.estimator.signals
-        hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
-        return (*hidden, *(() if covers(self.knowledge, "scheduler") else SENSORS_ONLY))
+        hidden = {s.name for s in signals if not covers(self.knowledge, s.knowledge)}
+        hidden |= set() if covers(self.knowledge, "scheduler") else {*SENSORS_ONLY}
+        if self.options.action == "threshold":  # the sensors compare their scores with it
+            hidden -= {*SCORES[self.options.score].names}
+        return tuple(sorted(hidden))
 
     def refuse_delay(self, reason: str, where: str = "") -> None:
         """Raise an error if the network delays packets.
@@ -434,6 +448,11 @@ EXCLUSIONS: tuple[tuple[str, Callable[[Task], Any], str, str], ...] = (
     ("action",
      lambda task: task.options.action == "assignment" and not task.network.rule.by_channel,
      "with access={task.options.access!r}", "it needs access='assignment'"),
+    ("score",
+     lambda task: task.options.action == "threshold" and task.options.score == "value"
+     and task.delayed, "with a delay", ONE_STEP),
+    ("action", lambda task: task.options.action == "threshold" and task.network.rule.by_channel,
+     "with access='assignment'", "a threshold names no channel"),
     ("memory", lambda task: _central(task) and task.options.memory,
      "with information='centre'", "it must be False, because the centre stores only deliveries"),
     ("memory_filter",

@@ -110,7 +110,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
                 f"action of each of {self.agents}"
             )
         selection = [actions[agent] for agent in self.agents]
-        outcome = self.batch.step(self.view.action.requests(selection, None))
+        outcome = self.batch.step(self.view.action.requests(selection, None, self.batch.signals))
         reward, (terminated, truncated) = float(outcome.reward[0]), ends_of(self.task, outcome)
         agents = self.agents
         costs = outcome.granted[:, 0] * self.task.network.bucket.cost[:, 0]

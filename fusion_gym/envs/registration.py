@@ -72,7 +72,7 @@ ENVIRONMENTS: dict[str, str | Build] = {
     "fusion_gym/CorrelatedTracking-v1": "fusion_gym.systems.correlated.environment:build_adaptive",
     "fusion_gym/MarkovJumpTracking-v1": "fusion_gym.systems.markov_jump.environment:build_markov",
     "fusion_gym/UnknownInput-v1": "fusion_gym.systems.unknown_input.environment:build_unknown",
-    "fusion_gym/BiasedOscillator-v1": "fusion_gym.systems.tobit.biased:build_biased_oscillator",
+    "fusion_gym/BiasedOscillator-v2": "fusion_gym.systems.tobit.biased:build_biased_oscillator",
     "fusion_gym/BiasedTracking-v1": "fusion_gym.systems.tobit.biased:build_biased_tracking",
     "fusion_gym/LinearFusion-v2": "fusion_gym.systems.tobit.linear:build_linear",
     "fusion_gym/RecordedFusion-v1": "fusion_gym.recordings.environment:build_recorded",

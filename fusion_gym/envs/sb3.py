@@ -122,7 +122,7 @@ class FusionSB3VecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Make one step in every run with the stored actions."""
         began = time.perf_counter()
-        requests = self.view.action.requests(self._actions, self.runs)
+        requests = self.view.action.requests(self._actions, self.runs, self.batch.signals)
         lengths, scale = self.batch.steps, self._scale()
         outcome = self._advance(requests)
         self._returns += outcome.reward

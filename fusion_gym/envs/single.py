@@ -113,7 +113,7 @@ class FusionEnv(vector.Specified, gymnasium.Env[Any, Any]):
         """
         if self.batch.finished[0]:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
-        outcome = self.batch.step(self.view.action.requests(action, None), 0)
+        outcome = self.batch.step(self.view.action.requests(action, None, self.batch.signals), 0)
         if self._film is not None:
             whole = map_arrays(lambda part: part[..., None].copy(), outcome)
             self._film.record(self.batch, whole)

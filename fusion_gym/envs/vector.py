@@ -192,7 +192,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         if not self._started.all():
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         batch = self.batch
-        requests = self.view.action.requests(actions, self.num_envs)
+        requests = self.view.action.requests(actions, self.num_envs, self.batch.signals)
         finished = batch.finished
         if self.autoreset_mode == AutoresetMode.DISABLED and finished.any():
             raise gymnasium.error.ResetNeeded(

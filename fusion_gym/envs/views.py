@@ -70,8 +70,8 @@ class SensorView:
         if task.options.information != "sensors":
             allowed = "'sensors', because a sensor uses its own measurement"
             raise refusal("information", task.options.information, allowed, "with a local view")
-        if task.options.action == "assignment":
-            allowed = "'binary', because the scheduler assigns channels"
+        if task.options.action in ("assignment", "threshold"):
+            allowed = "'binary', because this is an action of the scheduler"
             raise refusal("action", task.options.action, allowed, "with a local view")
         layout, count = ObservationLayout(task, "own"), task.sensors
         received = [

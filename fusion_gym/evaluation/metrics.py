@@ -144,7 +144,8 @@ METRICS = {
     "peak_age": Metric("age of information just before an arrival", "lower", "sensor"),
     "age_95": Metric("95 % quantile of the age of information", "lower", "sensor"),
     "incorrect_age": Metric(
-        "age of incorrect information: steps since the weighted squared error was at most 1", "lower"
+        "age of incorrect information: steps since the weighted squared error was at most 1",
+        "lower",
     ),
     "denied": Metric("requests denied per step", "lower", column="denied"),
     "return": Metric(

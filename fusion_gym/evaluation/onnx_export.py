@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.dqn.policies import DQNPolicy
+from stable_baselines3.td3.policies import TD3Policy
 
 from fusion_gym import seeds
-from fusion_gym.core.action import space_text
+from fusion_gym.core.action import Threshold, space_text
 from fusion_gym.core.knowledge import MEANING, Block, Knowledge, Signals, numbered
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
@@ -58,6 +59,8 @@ class DecisionGraph(torch.nn.Module):
     - ``request`` (B, k) int8, the decision: 1 requests to transmit.
     - ``probability`` (B, k) float32 of a request during learning, and the ``logits`` of the
       distribution. DQN has the ``values`` of the choices instead.
+    - ``threshold`` (B, k) float32 in the place of all these, of an agent that sets thresholds: the
+      sensor requests if its score, named in the metadata, reaches it; 0 always, infinity never.
 
     Args:
         agent: the agent.
@@ -73,7 +76,7 @@ class DecisionGraph(torch.nn.Module):
             allowed = "True; the graph also returns the probability of every request"
             raise refusal("deterministic", False, allowed, "here")
         action = agent.view.action
-        if not action.bits and not isinstance(action.space, spaces.Discrete):
+        if not action.bits and isinstance(action.space, spaces.MultiDiscrete):
             allowed = "another kind, because the graph requests without channels"
             raise refusal("action", agent.task.options.action, allowed, "here")
         if not isinstance(policy, tuple(POLICIES.values())):
@@ -88,6 +91,10 @@ class DecisionGraph(torch.nn.Module):
         # Each bit of an action has two outputs of the network, silence and a request.
         self._pairs = self._masked or isinstance(action.space, spaces.MultiDiscrete)
         self._values = isinstance(policy, DQNPolicy)
+        self._thresholds = action if isinstance(action, Threshold) else None
+        self._offset = agent.offset
+        if self._recurrent and self._thresholds is not None:
+            raise refusal("action", "threshold", "another kind with RecurrentPPO", "here")
         self._price = agent.price
         self._place = agent.view.names.index("price") if agent.price is not None else None
         stored = [place for place in range(len(agent.view.names)) if place != self._place]
@@ -109,6 +116,8 @@ class DecisionGraph(torch.nn.Module):
     def _named(self, sensors: int, policy: Any) -> tuple[Shapes, Shapes]:
         """Return names and shapes of the inputs and outputs."""
         inputs: Shapes = {"observation": ("batch", len(self.entries))}
+        if self._thresholds is not None:
+            return inputs, {"threshold": ("batch", sensors)}
         outputs: Shapes = {"request": ("batch", sensors)}
         if self._masked:
             inputs["grantable"] = ("batch", sensors)
@@ -132,6 +141,8 @@ class DecisionGraph(torch.nn.Module):
         if self._values:
             values = self._policy.q_net(rows)
             return self._taken(values), values
+        if self._thresholds is not None:
+            return (self._threshold(rows, self._thresholds),)
         policy, memory = self._policy, ()
         features = BasePolicy.extract_features(policy, rows, policy.pi_features_extractor)
         if self._recurrent:
@@ -146,6 +157,22 @@ class DecisionGraph(torch.nn.Module):
             marginal = probability @ self._table
             request = self._taken(probability)
         return request, marginal, logits, *memory
+
+    def _threshold(self, rows: torch.Tensor, action: Threshold) -> torch.Tensor:
+        """Return the thresholds (B, k) in the unit of the score."""
+        policy, (low, high) = self._policy, action.score.bounds
+        if hasattr(policy, "actor"):
+            actor = policy.actor
+            features = actor.extract_features(rows, actor.features_extractor)
+            own = actor.mu(features if isinstance(policy, TD3Policy) else actor.latent_pi(features))
+            own = own if isinstance(policy, TD3Policy) else torch.tanh(own)
+            own = low + 0.5 * (high - low) * (own + 1.0)
+        else:
+            features = BasePolicy.extract_features(policy, rows, policy.pi_features_extractor)
+            own = policy.action_net(policy.mlp_extractor.forward_actor(features))
+        own = torch.clamp(torch.clamp(own, low, high) + self._offset, low, high)
+        always = torch.where(own <= low, torch.zeros_like(own), torch.exp(own))
+        return torch.where(own >= high, torch.full_like(own, math.inf), always)
 
     def _probability(self, logits: torch.Tensor, open_: torch.Tensor | None) -> torch.Tensor:
         """Return the probability of each request (B, k), or with a table of each choice."""
@@ -210,6 +237,7 @@ _MEANINGS = {
     "probability": "probability of a request if actions are drawn, as in training",
     "logits": "logits of the distribution of actions",
     "values": "learned value of each action",
+    "threshold": "threshold of the score: a sensor requests if its score reaches it",
     "hidden_next": "memory for the next step",
     "cell_next": "memory for the next step",
 }
@@ -243,6 +271,7 @@ def onnx_card(
             "sensors": task.sensors,
             "access": task.options.access,
             "choices": None if graph.choices is None else graph.choices.tolist(),
+            "score": _score(agent),
         },
         "options": task.settings,
         "price_range": price if agent.price is None else None,
@@ -259,6 +288,15 @@ def onnx_card(
         "observation_version": f"{environment}:{digest[:16]}",  # hash of names and order
     }
     return words | {key: json.dumps(_finite(plain_options(value))) for key, value in values.items()}
+
+
+def _score(agent: ModelPolicy) -> Plain | None:
+    """Return the score of thresholds with its meaning and its unit's factor; ``None`` of others."""
+    action = agent.view.action
+    if not isinstance(action, Threshold):
+        return None
+    name, meaning = agent.task.options.score, action.score.meaning
+    return {"name": name, "meaning": meaning, "error_weight": action.scale}
 
 
 def _ports(shapes: Shapes) -> Plain:
@@ -373,15 +411,28 @@ class Agreement:
         self._memories = [_following(result), _following(required)]
         requests = self._agent(signals)
         self.observations += len(request["observation"])
-        decided = requests != result["request"].reshape(requests.shape[1], -1).T
+        decided = requests != self._decided(result, signals)
         self.different += int(decided.T.reshape(len(request["observation"]), -1).any(1).sum())
         for name in self._graph.outputs:
             if name != "request":
+                result[name], required[name] = (
+                    np.nan_to_num(item[name], posinf=1e9) for item in (result, required)
+                )
                 apart = np.abs(result[name].astype(np.float64) - required[name])
                 apart[np.isnan(apart)] = np.inf
                 self.difference = max(self.difference, float(apart.max()))
                 relative = apart / (1.0 + np.abs(required[name]))
                 self.relative = max(self.relative, float(relative.max()))
+        return requests
+
+    def _decided(self, result: Values, signals: Signals) -> Requests:
+        """Return the requests (sensors, N) of the file's outputs."""
+        action = self._agent.view.action
+        if isinstance(action, Threshold):
+            with np.errstate(divide="ignore"):
+                bounded = np.clip(np.log(result["threshold"]), *action.score.bounds)
+            return action.requests(bounded, len(bounded), lambda: signals)
+        requests: Requests = result["request"].reshape(len(signals["start"]), -1).T == 1
         return requests
 
     def _run_torch(self, value: Values) -> Values:

@@ -12,7 +12,7 @@ import inspect
 import pkgutil
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal, NamedTuple, TypedDict, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, get_args, overload
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from fusion_gym.entries import Arguments
 from fusion_gym.importing import TRUST, import_named
 from fusion_gym.policies.base import Policy, SearchRange, guard, owner_of
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys, refusal
+
+if TYPE_CHECKING:
+    from fusion_gym.policies.agent import PolicyAgent
 
 
 def parse_value(text: str) -> Any:
@@ -212,25 +215,39 @@ def with_settings(spec: str, settings: Mapping[str, Any], digits: int = 5) -> st
     return f"{spec}{',' if _parse_policy(spec)[2] else ':'}{joined}" if joined else spec
 
 
-def make_policy(spec: str, task: Task, *, trust: bool = False, trial: bool = True) -> Policy:
-    """Return the policy of a text.
+@overload
+def make_policy(spec: str, env: Task, *, trust: bool = False, trial: bool = True) -> Policy: ...
+
+
+@overload
+def make_policy(
+    spec: str, env: Any, *, trust: bool = False, trial: bool = True
+) -> "PolicyAgent": ...
+
+
+def make_policy(spec: str, env: Any, *, trust: bool = False, trial: bool = True) -> Any:
+    """Return the policy of a text for a task, or an agent that acts by it in an environment.
 
     Parameters that the text does not set have the task's defaults (``task.policy_defaults``) or the
     maker's defaults.
 
     Args:
         spec: text of the policy, ``NAME`` or ``NAME:key=value,…``.
-        task: the task, for example of :func:`~fusion_gym.make_task`.
+        env: the task, for example of :func:`~fusion_gym.make_task`; or an environment of
+            ``gym.make``, ``gym.make_vec``, :func:`~fusion_gym.make_sb3_vec_env`,
+            Stable-Baselines3's ``DummyVecEnv`` or :func:`~fusion_gym.parallel_env`, through its
+            wrappers.
         trust: whether ``model:PATH`` may run code of the file; otherwise the file is read as data.
         trial: whether to call the policy once, which reports errors before long work begins.
 
     Returns:
-        The policy, a function from signals to requests.
+        For a task the policy, a function from signals to requests; for an environment a
+        :class:`~fusion_gym.policies.agent.PolicyAgent` with Stable-Baselines3's ``predict``.
 
     Raises:
         ConfigurationError: an unknown policy or parameter, a value that is not allowed, a model
-            that cannot be read or has another observation layout, or a policy that uses signals
-            which the task withholds.
+            that cannot be read or has another observation layout, a policy that uses signals
+            which the task withholds, or an environment of another library or process.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
@@ -238,6 +255,11 @@ def make_policy(spec: str, task: Task, *, trust: bool = False, trial: bool = Tru
         >>> make_policy("send_on_delta:threshold=2", task).threshold
         2
     """
+    if not isinstance(env, Task):
+        from fusion_gym.policies.agent import PolicyAgent
+
+        return PolicyAgent(env, lambda task: make_policy(spec, task, trust=trust, trial=trial))
+    task: Task = env
     context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)
     if task.required_policy is not None:

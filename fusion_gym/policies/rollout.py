@@ -73,7 +73,8 @@ class Imagination:
             known.channel = signals["channel_state"][..., runs].reshape(-1, len(runs))
         network = rank_requests(task, task.network.draw(known, rest_of_first), estimate)
         control = signals["control"][:, runs] if task.controller else None
-        state = State(plant, estimate, network, control=control)
+        age, none = signals["age"], np.zeros(len(runs))  # which no decision uses
+        state = State(plant, estimate, network, age[:, runs], none, control=control)
         limit = np.full_like(steps, task.horizon)
         position = Position(state, signals["price"][runs], steps, limit)
         branch = Branch(task, self._memory.with_states(states), self._layout, position)

@@ -28,6 +28,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,15 +41,18 @@ from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.dqn.policies import DQNPolicy
+from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from fusion_gym import validation, zoo
 from fusion_gym.arrays import Array
-from fusion_gym.core.action import ACTIONS, space_text
+from fusion_gym.core.action import ACTIONS, SCORES, Threshold, space_text
 from fusion_gym.core.knowledge import Knowledge, Signals, least_covering
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.reward import Price
@@ -157,20 +161,23 @@ POLICIES: dict[str, type[BasePolicy]] = {
     for name, kind in ALGORITHMS.items()
     for policy in kind.policy_aliases.values()
     if policy
-    in (ActorCriticPolicy, DQNPolicy, MaskableActorCriticPolicy, RecurrentActorCriticPolicy)
-}
+    in (
+        ActorCriticPolicy, DQNPolicy, MaskableActorCriticPolicy, RecurrentActorCriticPolicy,
+        SACPolicy, TD3Policy, TQCPolicy,
+    )
+}  # fmt: skip
 _ACTIVATIONS: dict[str, type[nn.Module]] = {
     str(kind): kind for kind in (nn.ELU, nn.GELU, nn.LeakyReLU, nn.ReLU, nn.SiLU, nn.Tanh)
 }
 # The allowed policy_kwargs: those of the networks, and those without influence on a decision. A
 # features_extractor_class, for example, is code.
 _NETWORKS = {
-    "activation_fn", "enable_critic_lstm", "lstm_hidden_size", "n_lstm_layers", "net_arch",
-    "shared_lstm",
+    "activation_fn", "enable_critic_lstm", "lstm_hidden_size", "n_critics", "n_lstm_layers",
+    "n_quantiles", "net_arch", "shared_lstm",
 }  # fmt: skip
 _HARMLESS = {
     "log_std_init", "normalize_images", "optimizer_class", "optimizer_kwargs", "ortho_init",
-    "share_features_extractor",
+    "share_features_extractor", "use_sde",
 }  # fmt: skip
 # Entries of earlier cards, which the entries of Stable-Baselines3 repeat.
 _REPEATED = {"actions", "activation", "network"}
@@ -303,6 +310,10 @@ def _actions(data: Mapping[str, Any]) -> str:
     space = _table(data, "action_space")
     kind = re.sub(r".*\.(\w+)'>$", r"\1", str(space.get(":type:")))
     start = f", start={space['start']}" if str(space.get("start", 0)).strip("[0 \n]") else ""
+    if kind == "Box":
+        ends = ({*re.findall(r"[-.\de]+", str(space.get(end)))} for end in ("low", "high"))
+        low, high = (" ".join(sorted(end)) + "0" * (len(end) == 1) for end in ends)
+        return f"Box({low}, {high}, {tuple(space.get('_shape') or ())}, {space.get('dtype')})"
     number = " ".join(str(space.get("n", space.get("nvec"))).split())
     return f"{kind}({number}{start})"
 
@@ -360,9 +371,12 @@ class ModelPolicy:
         self._layout = None if same else ObservationLayout(self.task, owner)
         self._memory: Any = None  # of a recurrent policy
         self.normalization: VecNormalize | None = None  # of the training
+        self.offset = 0.0  # of the logarithms of thresholds
         self.stateless = deterministic and not isinstance(model, RecurrentPPO)
         self.knowledge: Knowledge = self.view.knowledge
         self.memory_owner = self.view.owner
+        if isinstance(self.view.action, Threshold):  # the sensors' scores take part
+            self.knowledge = least_covering((self.knowledge, self.view.action.score.knowledge))
         if isinstance(model, RecurrentPPO) and self.knowledge != "centre":
             self.knowledge = least_covering((self.knowledge, "own_memory"))
         span = self.task.reward.price.span
@@ -386,6 +400,10 @@ class ModelPolicy:
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
+        return self.view.action.requests(self._act(signals), len(signals["start"]), lambda: signals)
+
+    def _act(self, signals: Signals) -> NDArray[Any]:
+        """Return the actions of the rows."""
         masks = {}
         if isinstance(self.model, MaskablePPO):
             masks["action_masks"] = self.view.action.masks(signals["grantable"])
@@ -396,7 +414,9 @@ class ModelPolicy:
             deterministic=self.deterministic,
             **masks,
         )
-        return self.view.action.requests(action, len(signals["start"]))
+        if isinstance(self.view.action, Threshold):
+            action = np.clip(action + self.offset, *self.view.action.score.bounds)
+        return action
 
     def rows(self, signals: Signals) -> Rows:
         """Return the observation of the model (N·rows_per_run, entries), float32."""
@@ -416,6 +436,8 @@ class ModelPolicy:
     def check_logits(self) -> None:
         """Refuse an agent without one logit for each sensor."""
         action, model = self.view.action, self.model
+        if isinstance(action, Threshold):
+            return
         if isinstance(model, RecurrentPPO) or not hasattr(model.policy, "action_net"):
             allowed = "an agent with one logit for each sensor (ppo, a2c, trpo, maskable_ppo)"
             raise refusal("policy", type(model).__name__, allowed)
@@ -424,7 +446,13 @@ class ModelPolicy:
             raise refusal("action", str(action.space), allowed)
 
     def logits(self, signals: Signals) -> Array:
-        """Return the logit (sensors, N) of each sensor's request over its silence."""
+        """Return the logit (sensors, N) of each sensor's request over its silence.
+
+        With thresholds it is the logarithm of score over threshold.
+        """
+        action = self.view.action
+        if isinstance(action, Threshold):
+            return action.log_ratio(self._act(signals).T.astype(np.float64), signals)
         policy: Any = self.model.policy
         rows = torch.as_tensor(self.rows(signals))
         with torch.no_grad():
@@ -438,6 +466,9 @@ class ModelPolicy:
     def with_threshold(self, threshold: float) -> ModelPolicy:
         """Return the agent whose logits are lower by a threshold, in its last layer."""
         result = copy.deepcopy(self)
+        if isinstance(self.view.action, Threshold):
+            result.offset += threshold
+            return result
         policy: Any = result.model.policy
         with torch.no_grad():
             bias = policy.action_net.bias
@@ -487,7 +518,7 @@ def load_model_policy(
         ) from None
     except ConfigurationError as error:
         raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
-    task = task.with_options(action=action)
+    task = task.with_options(**action)
     policy = ModelPolicy(model, task, deterministic, price, observed)
     if normalize is not None:
         policy.normalization = _statistics(normalize, policy.view, trust)
@@ -546,8 +577,8 @@ def load_controller(path: str, observations: spaces.Box, actions: spaces.Space[A
 
 def _rebuilt(
     file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
-) -> tuple[BaseAlgorithm, str]:
-    """Return the model from its readable entries and its weights, and its kind of action."""
+) -> tuple[BaseAlgorithm, Arguments]:
+    """Return the model from its readable entries and its weights, and its actions' options."""
     algorithm, arguments, shape, actions = read_declaration(data)
     weights = read_weights(file)
     action, view = _fitted(task, observed, shape, actions)
@@ -591,7 +622,7 @@ def _model(
 
 def _unpickled(
     file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
-) -> tuple[BaseAlgorithm, str]:
+) -> tuple[BaseAlgorithm, Arguments]:
     """Return the model from the loader of Stable-Baselines3, which runs code of the file."""
     problems, known = [], algorithm_of(data)
     likely = ["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"]  # of an own policy
@@ -608,8 +639,8 @@ def _unpickled(
 
 def _fitted(
     task: Task, observed: ModelView, shape: tuple[int, ...], actions: str
-) -> tuple[str, View]:
-    """Return the model's kind of action, and the view of the task with it."""
+) -> tuple[Arguments, View]:
+    """Return the options of the model's actions, and the view of the task with them."""
     view, names = make_view(task, observed.local), observed.observation_names
     trained = "it was trained for another observation layout: it expects"
     if names is not None and names != tuple(view.names):
@@ -625,14 +656,18 @@ def _fitted(
             f"{trained} shape {shape}, the task (information={task.options.information!r}) has "
             f"{view.space.shape}"
         )
-    allowed: dict[str, tuple[str, View]] = {
-        space_text(view.action.space): (task.options.action, view)
-    }
-    if not observed.local and task.options.access != "single":
-        for kind in ACTIONS:
-            with suppress(ConfigurationError):  # the kind "discrete" of many sensors
-                other = make_view(task.with_options(action=kind))
-                allowed[space_text(other.action.space)] = (kind, other)
+    own = {"action": task.options.action}
+    allowed: dict[str, tuple[Arguments, View]] = {space_text(view.action.space): (own, view)}
+    kinds = {"threshold"} if task.options.access == "single" else {*ACTIONS}
+    for kind, score in () if observed.local else product(sorted(kinds), SCORES):
+        settings = {"action": kind, "score": score}
+        if kind != "threshold":
+            settings["score"] = task.options.score
+        elif not {*SCORES[score].names}.isdisjoint(task.hidden_signals):
+            continue  # which the task's information withholds
+        with suppress(ConfigurationError):  # the kind "discrete" of many sensors
+            other = make_view(task.with_options(**settings))
+            allowed.setdefault(space_text(other.action.space), (settings, other))
     if actions not in allowed:
         raise ConfigurationError(
             f"it has the action space {actions!r}: the task has {task.sensors} sensors, so it must "

@@ -213,7 +213,7 @@ class Algorithm:
     meaning: str
     source: str
     policy: str = "MlpPolicy"
-    actions: tuple[str, ...] = tuple(ACTIONS)
+    actions: tuple[str, ...] = tuple(name for name in ACTIONS if name != "threshold")
 
     @property
     def model(self) -> Any:
@@ -231,7 +231,7 @@ _CREDIT = "this library ([Learning](learning.md))"
 TABLE = {
     "a2c": Algorithm(
         f"{_SB3}A2C", A2CConfig, "advantage actor-critic",
-        "V. Mnih et al., ICML 2016 (arXiv 1602.01783)",
+        "V. Mnih et al., ICML 2016 (arXiv 1602.01783)", actions=tuple(ACTIONS),
     ),
     "counterfactual_maskable_ppo": Algorithm(
         f"{_OWN}CounterfactualMaskablePPO", CounterfactualConfig,
@@ -250,12 +250,12 @@ TABLE = {
     ),
     "ppo": Algorithm(
         f"{_SB3}PPO", PPOConfig, "proximal policy optimisation",
-        "J. Schulman et al., arXiv 1707.06347",
+        "J. Schulman et al., arXiv 1707.06347", actions=tuple(ACTIONS),
     ),
     "recurrent_ppo": Algorithm(
         f"{_MORE}RecurrentPPO", RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
         "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy",
-        actions=("multidiscrete", "discrete", "assignment"),
+        actions=("multidiscrete", "discrete", "assignment", "threshold"),
     ),
 }  # fmt: skip
 

@@ -448,8 +448,8 @@ def _now() -> tuple[float, float]:
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     """Return the training environment."""
     name, local = experiment.algorithm.name, experiment.environment.local
-    many = not local and task.options.access != "single"
-    if many and task.options.action not in TABLE[name].actions:
+    several = task.options.access != "single" or task.options.action == "threshold"
+    if not local and several and task.options.action not in TABLE[name].actions:
         reason = f"set the environment's option action: {' or '.join(TABLE[name].actions)}"
         raise forbidden("action", task.options.action, reason, f"with algorithm {name!r}")
     training, where = experiment.training, experiment.environment

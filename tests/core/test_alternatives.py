@@ -34,7 +34,7 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "heard": (OSCILLATOR, {"filter": "tobit", "memory": True, "broadcast": "packets"}),
     "single": (OSCILLATOR, {"access": "single", "sharing": "equal"}),
     "random": ("fusion_gym/BiasedTracking-v1", {"access": "random", "memory": True}),
-    "turns": ("fusion_gym/BiasedOscillator-v1", {"access": "round_robin"}),
+    "turns": ("fusion_gym/BiasedOscillator-v2", {"access": "round_robin"}),
     "correlated": ("fusion_gym/CorrelatedTracking-v1", {"memory": True, "noise_scale": "random"}),
     "markov": ("fusion_gym/MarkovJumpTracking-v1", {"information": "centre"}),
     "unknown": ("fusion_gym/UnknownInput-v1", {"memory": True, "horizon": 5}),

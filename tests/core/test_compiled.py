@@ -352,7 +352,7 @@ RULES = (
             for case in (
                 ("TobitOscillator-v1", {"memory": True, "filter": "tobit", "token_rate": 2.0}),
                 ("TobitOscillator-v1", {"memory": True, "broadcast": "estimate", "horizon": 40}),
-                ("BiasedOscillator-v1", {"memory": True, "access": "any"}),
+                ("BiasedOscillator-v2", {"memory": True, "access": "any"}),
                 ("CorrelatedTracking-v1", {"memory": True, "horizon": 30}),
             )
         ),

@@ -31,7 +31,7 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("TobitOscillator-v1", {"filter": "tobit"}),
     ("TobitOscillator-v1", {"filter": "tobit", "fusion": "ci", "memory": True}),
     ("TobitOscillator-v1", UNCENSORED | {"memory": True}),
-    ("BiasedOscillator-v1", {"memory": True}),
+    ("BiasedOscillator-v2", {"memory": True}),
     ("BiasedTracking-v1", {}),
     ("CorrelatedTracking-v1", {}),
     ("CorrelatedTracking-v1", {"memory": True, "fusion": "ci"}),

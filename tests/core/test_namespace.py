@@ -140,7 +140,7 @@ TASKS: list[tuple[str, dict[str, Any]]] = [
     *(("TobitOscillator-v1", {"filter": name}) for name in ("paper", "tobit", "kalman", "adf")),
     ("TobitOscillator-v1", {"filter": "paper", "silent": "predict", "error": "maximum"}),
     ("TobitOscillator-v1", {"filter": "stochastic", "stochastic_weight": 1.0, "error": "trace"}),
-    ("BiasedOscillator-v1", {"access": "round_robin"}),
+    ("BiasedOscillator-v2", {"access": "round_robin"}),
     ("BiasedTracking-v1", {"access": "random", "clock": True}),
     ("LinearFusion-v2", {"price_range": (0.1, 1.0), "cost_weight": "random"}),
     ("LinearFusion-v2", {"filter": "joint", "sharing": "fixed"}),

@@ -24,7 +24,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "fusion_gym/CorrelatedTracking-v1": {},
     "fusion_gym/MarkovJumpTracking-v1": {},
     "fusion_gym/UnknownInput-v1": {},
-    "fusion_gym/BiasedOscillator-v1": {"access": "any"},
+    "fusion_gym/BiasedOscillator-v2": {"access": "any"},
     "fusion_gym/BiasedTracking-v1": {"access": "any"},
     "fusion_gym/RemoteEstimation-v1": {"sensors": 2},
 }

@@ -18,7 +18,7 @@ from fusion_gym.solvers.silence import silence_bound
 from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
-BIASED = "fusion_gym/BiasedOscillator-v1"
+BIASED = "fusion_gym/BiasedOscillator-v2"
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"
 JUMP = "fusion_gym/MarkovJumpTracking-v1"
 LINEAR = "fusion_gym/LinearFusion-v2"

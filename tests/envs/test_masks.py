@@ -17,7 +17,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.saved import ModelPolicy, tag_model
 
 ENV_ID = "fusion_gym/TobitOscillator-v1"
-BIASED = "fusion_gym/BiasedOscillator-v1"
+BIASED = "fusion_gym/BiasedOscillator-v2"
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,7 @@ def test_every_learner_of_several_choices_trains(tmp_path: Path, kind: str) -> N
     ("kind", "action", "allowed"),
     [
         ("dqn", "multidiscrete", "action: discrete"),
-        ("recurrent_ppo", "binary", "action: multidiscrete or discrete or assignment"),
+        ("recurrent_ppo", "binary", "action: multidiscrete or discrete or assignment or threshold"),
     ],
 )
 def test_a_learner_of_other_actions_is_refused(

@@ -14,7 +14,7 @@ import fusion_gym
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"
-BIASED = "fusion_gym/BiasedOscillator-v1"
+BIASED = "fusion_gym/BiasedOscillator-v2"
 
 
 def vector(mode: str, num_envs: int = 3, **options: Any) -> Any:

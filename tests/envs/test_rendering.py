@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecVideoRecorder
 from fusion_gym.envs.registration import ENVIRONMENTS
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
-PICTURE = "fusion_gym/BiasedOscillator-v1"
+PICTURE = "fusion_gym/BiasedOscillator-v2"
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 

@@ -14,7 +14,7 @@ from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
 TOBIT = "fusion_gym/TobitOscillator-v1"
-BIASED = "fusion_gym/BiasedOscillator-v1"
+BIASED = "fusion_gym/BiasedOscillator-v2"
 TRACKING = "fusion_gym/BiasedTracking-v1"
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"
 STRUCTURE = Structure("all nodes start from the same prediction", ("information shares",))

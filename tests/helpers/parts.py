@@ -30,7 +30,8 @@ class Parts:
         """The states at time 0 from normals (start_channels, N)."""
         plant, announcement = self.plant.start(noise)
         estimate = self.estimator.start(self.plant.measurement(plant), announcement)
-        return State(plant, estimate, network=None)  # type: ignore[arg-type]
+        nothing: Any = None
+        return State(plant, estimate, network=nothing, age=nothing, incorrect_age=nothing)
 
     def sense(self, state: State, noise: Array) -> State:
         """The states after the plant moved with normals (noise_channels, N)."""

@@ -43,7 +43,7 @@ def test_committed_experiments_are_valid(path: Path) -> None:
 
 @pytest.mark.usefixtures("unsearched")
 def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
-    for name, env_id in (("tobit_oscillator", ENV), ("biased", "fusion_gym/BiasedOscillator-v1")):
+    for name, env_id in (("tobit_oscillator", ENV), ("biased", "fusion_gym/BiasedOscillator-v2")):
         sweep = load_checked(Sweep, CONFIGS / f"{name}_sweep.yaml")
         task = fusion_gym.make_task(env_id)
         policies = sweep.policies(task.reward.price)

@@ -10,6 +10,7 @@ from cases import SCARCE, VARIANTS, Options
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.registration import present_id
 
 RUNS, STEPS, SETS = 3, 300, 2
 VALUES: dict[str, tuple[Any, ...]] = {
@@ -38,7 +39,7 @@ def drawn(name: str) -> Iterator[tuple[Options, list[EpisodeBatch]]]:
                 options[option] = values[rng.integers(len(values))]
         try:
             tasks = [
-                fusion_gym.make_task(f"fusion_gym/{name}-v1", backend=backend, **options)
+                fusion_gym.make_task(present_id(name), backend=backend, **options)
                 for backend in ("numpy", "compiled")
             ]
         except fusion_gym.ConfigurationError:

@@ -80,7 +80,7 @@ def leaves(part: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield from leaves(value, f"{name}.{key}")
 
 
-OF_ERRORS = ("reward", "reward_error", "error", "squared_error", "diverged")
+OF_ERRORS = ("reward", "reward_error", "error", "squared_error", "incorrect_age", "diverged")
 
 
 def shown(batch: EpisodeBatch, outcome: Outcome | None) -> dict[str, Any]:

@@ -140,7 +140,7 @@ CASES += [
 ]
 CASES += [
     (name, BIASED | {"filter": kind})
-    for name in ("BiasedOscillator-v1", "BiasedTracking-v1")
+    for name in ("BiasedOscillator-v2", "BiasedTracking-v1")
     for kind in ("paper", "adf", "kalman")
 ]
 CASES += [

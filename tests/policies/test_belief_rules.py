@@ -150,7 +150,7 @@ def test_what_differs_is_measured_in_the_states_unit_or_whitened() -> None:
         np.testing.assert_array_equal(value.T[single.T], value.max(0)[selected])
 
 
-@pytest.mark.parametrize("env_id", [TOBIT, "fusion_gym/BiasedOscillator-v1"])
+@pytest.mark.parametrize("env_id", [TOBIT, "fusion_gym/BiasedOscillator-v2"])
 def test_a_sensor_without_memory_looks_at_what_its_measurement_would_change(env_id: str) -> None:
     """A threshold on |W^½ (x̂(s) - x̂)|."""
     task = task_of(env_id, access="any")

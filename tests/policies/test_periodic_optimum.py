@@ -14,6 +14,7 @@ import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import present_id
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies import periodic_optimum
 from fusion_gym.policies.periodic_optimum import PeriodicOptimum, episode_traces, steady_traces
@@ -130,7 +131,7 @@ def biased(name: str = "Tracking", **options: Any) -> Task:
         "censoring_threshold": -np.inf,
         "censoring_upper": np.inf,
     }
-    return fusion_gym.make_task(f"fusion_gym/Biased{name}-v1", **free | options)
+    return fusion_gym.make_task(present_id(f"Biased{name}"), **free | options)
 
 
 def all_schedules(packets: int, period: int, sensors: int) -> NDArray[np.bool_]:

@@ -72,6 +72,10 @@ class Silence(Action):
     def decode(self, choices: Choices) -> NDArray[Any]:
         """See :class:`Action`."""
         return np.equal(choices, 0)
+
+    def actions(self, requests: Requests) -> NDArray[Any]:
+        """See :class:`Action`."""
+        return super().actions(~requests)
 '''
 BUCKET = "core/token_bucket.py"
 RESULTS, METRICS = "evaluation/episodes.py", "evaluation/metrics.py"
@@ -177,10 +181,16 @@ ADDITIONS = {
         "assert env.step(np.array([1, 1, 0]))[-1]['granted'].tolist() == [False, False, True]\n"
         "masks = env.unwrapped.action_masks()\n"
         "assert masks.shape == (6,)\n"
-        "assert 'A 0 requests' in env.unwrapped.__doc__",
+        "assert 'A 0 requests' in env.unwrapped.__doc__\n"
+        "always = fusion_gym.make_policy('always', env)\n"
+        "assert always.predict(env.reset(seed=0)[0])[0].tolist() == [0, 0, 0]",
         lines=(
             ("core/action.py", "ACTIONS: dict[str, type[Action]] = {", '    "silence": Silence,'),
-            ("core/action.py", "        return super().choose(scores, threshold) & best", ACTION),
+            (
+                "core/action.py",
+                "        return super().choose(scores, threshold) & _largest(scores)",
+                ACTION,
+            ),
         ),
     ),
     "a filter": Addition(

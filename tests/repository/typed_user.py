@@ -146,7 +146,7 @@ def options_objects() -> list[Task]:
 def mistakes(task: Task, policy: Policy) -> None:
     """What the types must tell."""
     fusion_gym.make_taks(OSCILLATOR)  # type: ignore[attr-defined]
-    fusion_gym.make_policy(3, task)  # type: ignore[arg-type]
+    fusion_gym.make_policy(3, task)  # type: ignore[call-overload]
     run_episodes(task, policy, "many", 0)  # type: ignore[arg-type]
     run_episodes(policy, task, 3, 0)  # type: ignore[arg-type]
     LinearFusionOptions(token_rat=2.0)  # type: ignore[call-arg]

@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from fusion_gym.arrays import Array
-from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.registration import make_task, present_id
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.metrics import mean_interval
 from fusion_gym.policies.registry import make_policy
@@ -244,7 +244,7 @@ def test_coordinates_make_noise_and_curvature_diagonal() -> None:
 def test_tasks_without_the_bound_and_other_values_are_refused(
     env: str, options: dict[str, Any], change: dict[str, Any], message: str
 ) -> None:
-    task = make_task(f"fusion_gym/{env}-v1", **options)
+    task = make_task(present_id(env), **options)
     with pytest.raises(ConfigurationError, match=f"^{message}") as caught:
         silence_bound(task, **{"rates": (0.1,)} | change)
     assert "\n" not in str(caught.value)
@@ -262,7 +262,7 @@ def test_tasks_without_the_bound_and_other_values_are_refused(
     ],
 )
 def test_where_it_applies_silence_is_prediction(env: str, options: dict[str, Any]) -> None:
-    task = make_task(f"fusion_gym/{env}-v1", horizon=5, **options)
+    task = make_task(present_id(env), horizon=5, **options)
     assert silence_model(task).floor > 0.0
     system = Parts.of(task)
     draw = np.random.default_rng(0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,6 +50,9 @@ class BiasedOscillatorOptions(system.FeedbackOptions):
 
     The defaults are the oscillator of the paper's Section IV.A. The paper does not give, and we
     chose: ``information_shares`` (equal) and the reward.
+
+    v2: by default requests at an even pace have errors that cost 1 a step, and the price of a token
+    is 0.3. In v1 it was 0.01, so that a learner saw little but the error's noise.
 
     Example:
         >>> import fusion_gym
@@ -91,6 +94,8 @@ class BiasedOscillatorOptions(system.FeedbackOptions):
     censoring_upper: ArrayLike = 5.0
     """Upper limit υ of equation (6): one number or (sensors, components). Infinity never
     censors."""
+    reward_scale: float | Literal["auto"] | None = "auto"
+    cost_weight: float | Literal["random"] = 0.3
     access: AccessRule = "single"
     tokens: Tokens = "unlimited"
     token_rate: ArrayLike = 1.0
@@ -128,6 +133,8 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
         (2, 'single', 50)
     """
 
+    reward_scale: float | Literal["auto"] | None = None
+    cost_weight: float | Literal["random"] = 0.01
     transition: ArrayLike = ((1.0, _PERIOD), (0.0, 1.0))
     process_covariance: ArrayLike = ((0.0025, 0.0), (0.0, 0.0025))
     initial_mean: ArrayLike = (10.0, 0.0)

@@ -18,7 +18,7 @@ from fusion_gym.systems.tobit.filters import AssumedDensityFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredEstimator
 
-OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
+OSCILLATOR = "fusion_gym/BiasedOscillator-v2"
 TRACKING = "fusion_gym/BiasedTracking-v1"
 EPISODES = 1000
 
