@@ -56,14 +56,14 @@ class Demo(Long):
         for name in CONFIGS:
             folder = self.output / name
             agent = folder / "agent"
+            policy = f"model:{agent / 'calibrated_model.zip'}"
             points = Compare(
                 config=str(agent / "config.yaml"),
                 sweep="scale_free_sweep",
-                policy=f"model:{agent / 'calibrated_model.zip'}",
                 prices=7,
                 episodes=self.episodes,
                 output=folder / "comparison",
-            ).points()
+            ).points(policy)
             savings.append(f"{-np.mean([point.at_price.relative for point in points]):.1%}")
         paper = self._saving(agent / "config.yaml", points)
         lines = {

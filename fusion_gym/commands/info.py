@@ -23,7 +23,7 @@ from fusion_gym.commands.command_line import Command, OutputFile
 from fusion_gym.commands.fit import LogOptions
 from fusion_gym.commands.list import catalogue
 from fusion_gym.docstrings import plain_marks
-from fusion_gym.envs.registration import present_id
+from fusion_gym.envs.registration import base_of, present_id
 from fusion_gym.output.progress import writing
 from fusion_gym.output.tables import console
 from fusion_gym.validation import nearest, refusal
@@ -35,14 +35,15 @@ class Info(LogOptions, Command):
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """A name of fusion-gym list, or the CSV file of a log; an environment's name may omit
-    fusion_gym/ and the version."""
+    fusion_gym/ and the version, and module:id imports the module first."""
     picture: Annotated[Path | None, OutputFile(".png", ".pdf", ".svg")] = None
     """File for a picture of the log."""
 
     def run(self) -> None:
         """Print the page of every entry of this name, or the card of the log."""
+        is_own = re.fullmatch(r"[\w.]+:[\w/-]+", self.name)
+        name, registered = base_of(self.name) if is_own else (present_id(self.name), {})
         entries = catalogue()
-        name = present_id(self.name)
         names = [entry for named in entries.values() for entry in named]
         is_log = name in ("mast", "tanks") or ".csv" in Path(name).suffixes
         if name not in names and (is_log or Path(name).is_file()):
@@ -58,6 +59,8 @@ class Info(LogOptions, Command):
         for kind, named in entries.items():
             if name in named:
                 print(plain_text(f"# {name} ({kind})\n\n{named[name].page()}", console()))
+        if registered:
+            print(f"{self.name} is {name} with {registered}")
 
     def show_log(self) -> None:
         """Print the data card of a log, and draw its readings if there is a file for them."""

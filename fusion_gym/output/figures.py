@@ -28,17 +28,8 @@ def pareto(
     Bars are 95 % intervals over episodes.
     """
     figure, (front, beside) = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
-    colours = [BLUE, SKY, GREEN, PURPLE][: len(lines) - 1]
-    for line, colour in zip(lines, [*colours, AGENT], strict=True):
-        _draw(front, line, colour)
-    front.set(xlabel="transmissions per sensor and step", ylabel="mean squared error")
-    means = np.array([result.mse.mean() for line in lines for result in line.results])
-    if means.max() > 6 * means.min():
-        front.set_yscale("log")
-        front.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
-    front.set_xlim(left=-0.005)
+    _draw_front(front, lines, [*[BLUE, SKY, GREEN, PURPLE][: len(lines) - 1], AGENT])
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
-    front.legend(fontsize=8, loc="upper right")
     mean, low, high = np.array([c.difference for c in costs]).T / [c.cost or np.nan for c in costs]
     spread, places = 100.0 * np.abs([mean - low, high - mean]), np.arange(len(costs))
     beside.axhline(0.0, color=BLUE, lw=1.6)
@@ -47,6 +38,36 @@ def pareto(
     cost = f"cost above the best rule's [%]\n(below 0: {lines[-1].label} is cheaper)"
     beside.set(xlabel="price of a token", ylabel=cost)
     save_figure(figure, path)
+
+
+def rules(path: Path, title: str, lines: Sequence[FigureLine], span: tuple[float, float]) -> None:
+    """Draw MSE against transmission rate, and each rule's cost at prices above the least cost."""
+    figure, (front, costs) = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
+    colours = [f"C{place}" for place in range(len(lines))]
+    _draw_front(front, lines, colours)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+    prices = np.geomspace(*span, 40)
+    means = [[(r.error_cost.mean(), r.tokens.mean()) for r in line.results] for line in lines]
+    each = [(np.array(own) @ [np.ones(40), prices]).min(0) for own in means]
+    for own, colour in zip(each, colours, strict=True):
+        costs.plot(prices, 100.0 * (own / np.min(each, axis=0) - 1.0), color=colour)
+    label = "cost = error + price · tokens,\nabove the cheapest rule's [%]"
+    costs.set_xscale("log")
+    costs.xaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
+    costs.set(ylim=(-2, 60), xlabel="price of a token", ylabel=label)
+    save_figure(figure, path)
+
+
+def _draw_front(axes: plt.Axes, lines: Sequence[FigureLine], colours: Sequence[str]) -> None:
+    for line, colour in zip(lines, colours, strict=True):
+        _draw(axes, line, colour)
+    axes.set(xlabel="transmissions per sensor and step", ylabel="mean squared error")
+    means = np.array([result.mse.mean() for line in lines for result in line.results])
+    if means.max() > 6 * means.min():
+        axes.set_yscale("log")
+        axes.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
+    axes.set_xlim(left=-0.005)
+    axes.legend(fontsize=8, loc="upper right")
 
 
 def plain_tick(value: float, place: float | None = None) -> str:

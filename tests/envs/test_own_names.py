@@ -116,6 +116,17 @@ def test_a_command_finds_the_module_beside_it(own: Path) -> None:
     assert "own_names:Oldest" in (own / "found.json").read_text()
 
 
+def test_an_own_environment_has_a_page_and_a_comparison(own: Path) -> None:
+    name = "own_names:me/OwnCart-v0"
+    page = succeed("info", [name]).out
+    assert "me/OwnCart-v0 (environments)" in page
+    assert f"{VARIANT} is {TOBIT} with" in succeed("info", [VARIANT]).out
+    words = ["--env", name, "--set", "horizon=20", "--episodes", "4", "--output", "compared"]
+    printed = succeed("compare", [*words, "--policies", "own_names:Oldest", "send_on_delta"]).out
+    assert "own_names:Oldest" in printed
+    assert "me/Other-v0" in refusal("info", ["own_names:me/Other-v0"])
+
+
 def test_a_variant_is_its_environment_with_the_options_of_its_registration(own: Path) -> None:
     options = {"filter": "tobit", "token_rate": 3.0, "max_episode_steps": 7}
     expected = fusion_gym.make_task(TOBIT, **options)
