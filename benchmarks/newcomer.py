@@ -77,14 +77,16 @@ def run(line: str, folder: Path) -> tuple[str, str, str]:
 def points_table(path: Path) -> str:
     """Return the table of the agent and the best rule at each price."""
     rows = []
-    for point in json.loads(path.read_text())["points"]:
-        comparison: Plain = point["at_price"]
-        cost, difference = comparison["cost"], comparison["difference"]
+    for row in json.loads(path.read_text())["prices"]:
+        policies: dict[str, Plain] = row["policies"]
+        agent = policies.pop("model:best_model.zip")
+        best = min(policies, key=lambda name: policies[name]["mean"])
+        cost, difference = policies[best]["mean"], agent["difference"]
         ends = (f"{difference[end] / cost:+.1%}" for end in ("low", "high"))
-        cells = f"{comparison['price']:.3g}", f"{point['rate']:.3f}", f"{point['mse']:.3g}"
         change = f"{difference['mean'] / cost:+.1%} [{', '.join(ends)}]"
-        rows.append((*cells, f"`{comparison['best']}`", change))
-    heads = "price", "agent's rate", "its MSE", "best rule", "agent's cost over the rule's"
+        cells = f"{row['price']:.3g}", f"{agent['mean']:.4g}", f"`{best}`", f"{cost:.4g}"
+        rows.append((*cells, change))
+    heads = "price", "agent's cost", "best rule", "its cost", "difference"
     return table(heads, rows) + f"\n\nMeasured in fusion-gym {__version__}."
 
 

@@ -20,8 +20,11 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.errors import forbidden
 from fusion_gym.validation import refusal
 
+# Arguments of Stable-Baselines3's make_vec_env, which makes one environment after the other.
+_OF_SB3 = {"wrapper_class", "wrapper_kwargs", "env_kwargs", "vec_env_cls", "vec_env_kwargs"}
 _MOST_BITS = 62  # of an integer that encodes grants and run
 
 
@@ -237,6 +240,7 @@ def make_sb3_vec_env(
     stagger: bool = False,
     local: bool = False,
     training_error: str = "squared",
+    render_mode: str | None = None,
     **options: Any,
 ) -> FusionSB3VecEnv:
     """Return the Stable-Baselines3 ``VecEnv`` of a registered environment.
@@ -250,6 +254,7 @@ def make_sb3_vec_env(
         training_error: Error term of the rewards. ``"excess"`` and ``"mismatch"`` subtract the part
             that no policy changes (:meth:`~fusion_gym.core.reward.Reward.training_error`). The
             returns in infos are always the task's.
+        render_mode: ``"rgb_array"`` for pictures, or ``None``.
         **options: Options of ``gym.make`` for this id.
 
     Raises:
@@ -261,15 +266,17 @@ def make_sb3_vec_env(
         >>> envs.num_envs, envs.reset().shape
         (4, (4, 32))
     """
+    for name in _OF_SB3 & options.keys():
+        reason = "wrap the result in a VecEnvWrapper, or make single environments with make_vec_env"
+        raise forbidden(name, options[name], f"the runs share one batch; {reason}")
     task = make_task(env_id, **options)
+    shared: Any = {"stagger": stagger, "local": local, "render_mode": render_mode}
     if training_error == "squared":
-        env = FusionSB3VecEnv(task, num_envs, stagger=stagger, local=local)
+        env = FusionSB3VecEnv(task, num_envs, **shared)
     else:
         validation.choice("training_error", training_error, TRAINING_ERRORS)
         reference = reference_estimator(env_id, options)
-        env = PrivilegedVecEnv(
-            task, num_envs, error=training_error, reference=reference, stagger=stagger, local=local
-        )
+        env = PrivilegedVecEnv(task, num_envs, error=training_error, reference=reference, **shared)
     if seed is not None:
         env.seed(seed)
     return env

@@ -15,7 +15,14 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.entries import State
-from fusion_gym.envs.vector import Infos, ends_of, refuse_vector_reward
+from fusion_gym.envs.drawing import Film, Frame
+from fusion_gym.envs.vector import (
+    FRAMES_PER_SECOND,
+    Infos,
+    checked_mode,
+    ends_of,
+    refuse_vector_reward,
+)
 from fusion_gym.envs.views import make_view
 
 
@@ -36,6 +43,7 @@ class FusionSB3VecEnv(VecEnv):
             reward of its run.
         price_exponent: Exponent from 0 to 1 of :meth:`~fusion_gym.core.reward.Price.scale`, which
             multiplies the rewards, but not the returns in the infos.
+        render_mode: ``"rgb_array"`` for a picture of each run, or ``None``.
 
     Attributes:
         view: The view that makes the rows, of the scheduler or of every sensor.
@@ -65,6 +73,7 @@ class FusionSB3VecEnv(VecEnv):
         stagger: bool = False,
         local: bool = False,
         price_exponent: float = 0.0,
+        render_mode: str | None = None,
     ) -> None:
         refuse_vector_reward(task, "with Stable-Baselines3")
         self.runs = validation.runs(num_envs)
@@ -80,8 +89,11 @@ class FusionSB3VecEnv(VecEnv):
         self.seconds = 0.0
         self.totals = (0.0, 0)
         self.requests = (0, 0)
-        self.render_mode = None
+        self.render_mode = checked_mode(type(self).__name__, render_mode, ("rgb_array",))
+        self._film = None if self.render_mode is None else Film(task, num_envs)
         super().__init__(num_envs * self._rows, self.view.space, self.view.action.space)
+        metadata: Any = self.metadata
+        metadata["render_fps"] = FRAMES_PER_SECOND
         self._actions: Any = None
         self._returns = np.zeros(num_envs)
         self._spent = np.zeros(num_envs)
@@ -125,6 +137,8 @@ class FusionSB3VecEnv(VecEnv):
         requests = self.view.action.requests(self._actions, self.runs, self.batch.signals)
         lengths, scale = self.batch.steps, self._scale()
         outcome = self._advance(requests)
+        if self._film is not None:
+            self._film.record(self.batch, outcome)
         self._returns += outcome.reward
         self._spent += outcome.cost
         self.totals = (self.totals[0] + float(outcome.cost.sum()), self.totals[1] + self.runs)
@@ -185,6 +199,8 @@ class FusionSB3VecEnv(VecEnv):
     def _begin(self, runs: NDArray[np.int64] | None = None) -> None:
         """Begin new episodes in ``runs``, or the first ones in all, whose lengths may spread."""
         self.batch.reset(runs, stagger=self.stagger and runs is None, groups=self._groups)
+        if self._film is not None:
+            self._film.begin(self.batch, runs)
 
     def _advance(self, requests: NDArray[Any]) -> Outcome:
         """Step the batch, before finished runs are reset."""
@@ -206,6 +222,11 @@ class FusionSB3VecEnv(VecEnv):
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the choices (N, choices), bool, that the network can grant as a single request."""
         return self.view.action.masks(self.batch.grantable())
+
+    def get_images(self) -> Sequence[Frame]:
+        """Return a picture (height, width, 3) of every run, which :meth:`render` tiles."""
+        assert self._film is not None
+        return [self._film.frame(run) for run in range(self.runs)]
 
     def close(self) -> None:
         """Do nothing, because there are no resources to release."""

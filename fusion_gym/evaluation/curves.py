@@ -1,7 +1,9 @@
-"""Rules over their first parameter, for comparisons at an equal rate or at an equal price."""
+"""Policies over a parameter, for comparisons at equal rates and at equal prices."""
 
+import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,31 +20,32 @@ from fusion_gym.policies.registry import (
     policy_names,
     policy_parameters,
     search_ranges,
-    with_settings,
 )
+from fusion_gym.validation import ConfigurationError
 
 _COARSE, _EPISODES = 33, 16  # values over the whole range, to see where the tokens change
 _LEFT = 0.02  # share of the most tokens within which the tokens hardly change
 Curve = Mapping[str, EpisodeResults]
 
 
-def sweep(task: Task, text: str, count: int = 24) -> list[str]:
-    """Return the texts of a rule over its first parameter where that changes the tokens.
+def sweep(task: Task, text: str, prices: Sequence[float], count: int = 24) -> list[str]:
+    """Return the policies of a curve.
 
-    A text that sets this parameter, an agent and a rule without parameters are single policies.
+    They have values of ``{value}`` in the text, or else of the rule's ``price`` or first parameter,
+    where it changes the tokens. An agent or an optimum of several prices runs at ``prices``. Other
+    policies, and rules whose text sets that parameter, are alone.
     """
-    name = text.partition(":")[0]
-    bare = text if "=" not in text else text.rpartition(":")[0]
-    every, rest = search_ranges(bare), search_ranges(text)
-    others = {*policy_names()} - {*policy_names("agent")}
-    if name in others and "price" in policy_parameters(name):
-        every = {"price": SHARED_THRESHOLD}
-        rest = every if "price=" not in text else {}
-    parameter, own = next(iter(every.items()), ("", SHARED_THRESHOLD))
-    if parameter not in rest:
-        make_policy(text, task)
+    make_policy(text.replace("{value}", "1"), task)
+    template, own = _template(text)
+    if "{value}" not in template:
         return [text]
-    template = with_settings(text, {parameter: "{value}"})
+    if own is None:
+        with suppress(ConfigurationError):  # of an agent of one price
+            texts = [template.replace("{value}", repr(price)) for price in prices]
+            for each in texts:
+                make_policy(each, task)
+            return texts or [text]
+        return [text]
     grid = _values(own, own[:2], _COARSE)
     trials = try_thresholds(task, template, grid.tolist(), _EPISODES, seeds.TUNING.start)
     share = np.array([trial.tokens for trial in trials])
@@ -53,16 +56,46 @@ def sweep(task: Task, text: str, count: int = 24) -> list[str]:
     return [template.replace("{value}", f"{value:.4g}") for value in _values(own, ends, count)]
 
 
+def _template(text: str) -> tuple[str, SearchRange | None]:
+    """Return the text with ``{value}`` for the parameter of its curve, and the parameter's range.
+
+    ``None`` stands for the prices.
+    """
+    if "{value}" in text:
+        return text, SHARED_THRESHOLD
+    name, _, settings = text.partition(":")
+    priced = name in policy_names() and "price" in policy_parameters(name)
+    if name not in policy_names():  # module:Rule
+        kind, _, settings = settings.partition(":")
+        name = f"{name}:{kind}"
+    every = search_ranges(name)
+    parameter, own = next(iter(every.items()), ("", SHARED_THRESHOLD))
+    if priced:
+        parameter, own = "price", SHARED_THRESHOLD
+    if not parameter or re.search(f"[:,]{parameter}=", text):
+        return text, None
+    entries = [entry for entry in (f"{parameter}={{value}}", settings) if entry]
+    if name in policy_names("agent"):  # its file comes first; the text of a base comes last
+        entries.reverse()
+    return f"{name}:{','.join(entries)}", own if every else None
+
+
 def _values(own: SearchRange, ends: Sequence[float], count: int) -> Array:
     first, last = own.coordinate(np.array(ends))
     return np.unique(own.value(np.linspace(first, last, count)))
 
 
 class Comparison(NamedTuple):
-    """A policy's mean, and its paired difference to the least mean of all policies."""
+    """A policy's mean, and its paired difference to the least mean of the other policies."""
 
     mean: float
     difference: Interval
+
+    @property
+    def relative(self) -> Interval:
+        """The difference as shares of that least mean."""
+        least = self.mean - self.difference.mean
+        return Interval(*(end / least if least else np.nan for end in self.difference))
 
     def plain(self) -> Plain:
         """Return the comparison as JSON."""
@@ -71,11 +104,13 @@ class Comparison(NamedTuple):
 
 def compare(samples: Mapping[str, Array | None]) -> dict[str, Comparison | None]:
     """Return the comparison of policies by their samples, one per episode."""
-    least = min((s for s in samples.values() if s is not None), key=lambda own: float(own.mean()))
-    return {
-        name: None if own is None else Comparison(float(own.mean()), mean_interval(own - least))
-        for name, own in samples.items()
-    }
+    known: dict[str, Any] = {name: own for name, own in samples.items() if own is not None}
+    order = sorted(known, key=lambda name: float(known[name].mean()))
+    result: dict[str, Comparison | None] = dict.fromkeys(samples)
+    for name, own in known.items():
+        least = known[next((other for other in order if other != name), name)]
+        result[name] = Comparison(float(own.mean()), mean_interval(own - least))
+    return result
 
 
 def error_at_rate(curve: Curve, rate: float) -> Array | None:

@@ -389,51 +389,6 @@ def compare_with_envelope(
     )
 
 
-class PriceComparison(NamedTuple):
-    """A policy against the best baseline at one price of a token, over paired episodes.
-
-    Args:
-        price: price of a token.
-        best: name of the best baseline.
-        cost: mean cost of the best baseline per step.
-        difference: cost of the policy minus ``cost``, with its interval; negative: the policy is
-            better.
-    """
-
-    price: float
-    best: str
-    cost: float
-    difference: Interval
-
-    @property
-    def relative(self) -> float:
-        """The difference as a share of the baseline's cost; NaN if that is zero."""
-        return self.difference.mean / (self.cost or np.nan)
-
-
-def compare_at_price(
-    results: EpisodeResults, baselines: Mapping[str, EpisodeResults], price: float
-) -> PriceComparison:
-    """Return the paired difference of the cost per step to the best baseline.
-
-    The cost is error + price · tokens. The best baseline has the least mean cost on these episodes;
-    this choice favours the baselines.
-
-    Args:
-        results: results of the policy.
-        baselines: results of the baselines by name, on the same episodes.
-        price: price of a token.
-
-    Raises:
-        ConfigurationError: no baselines, or another number of episodes.
-    """
-    _check_pairs(results, baselines)
-    costs = {name: item.cost(price) for name, item in baselines.items()}
-    best = min(costs, key=lambda name: float(costs[name].mean()))
-    difference = results.cost(price) - costs[best]
-    return PriceComparison(price, best, float(costs[best].mean()), mean_interval(difference))
-
-
 def _check_pairs(results: EpisodeResults, baselines: Mapping[str, EpisodeResults]) -> None:
     if not baselines:
         raise ConfigurationError("policies = {} is not allowed: at least one baseline is needed")

@@ -75,6 +75,7 @@ class DecisionGraph(torch.nn.Module):
         if not agent.deterministic:
             allowed = "True; the graph also returns the probability of every request"
             raise refusal("deterministic", False, allowed, "here")
+        agent.refuse_frames()
         action = agent.view.action
         if not action.bits and isinstance(action.space, spaces.MultiDiscrete):
             allowed = "another kind, because the graph requests without channels"

@@ -1,5 +1,6 @@
 """Figures of results: the Pareto front and the costs."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -8,9 +9,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fusion_gym.evaluation.episodes import EpisodeResults
-from fusion_gym.evaluation.metrics import PriceComparison, mean_interval
+from fusion_gym.evaluation.metrics import mean_interval
 from fusion_gym.output.files import replacing
-from fusion_gym.output.palette import AGENT, BLUE, GREEN, PURPLE, SKY
+from fusion_gym.output.palette import AGENT, BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY
 
 
 class FigureLine(NamedTuple):
@@ -20,54 +21,32 @@ class FigureLine(NamedTuple):
     results: Sequence[EpisodeResults]
 
 
-def pareto(
-    path: Path, title: str, lines: Sequence[FigureLine], costs: Sequence[PriceComparison]
-) -> None:
-    """Draw MSE against transmission rate, and the last line's cost beside the best baseline's.
+def pareto(path: Path, title: str, lines: Sequence[FigureLine], span: tuple[float, float]) -> None:
+    """Draw MSE against transmission rate, and each curve's cost above the least at prices.
 
     Bars are 95 % intervals over episodes.
     """
-    figure, (front, beside) = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
-    _draw_front(front, lines, [*[BLUE, SKY, GREEN, PURPLE][: len(lines) - 1], AGENT])
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11)
-    mean, low, high = np.array([c.difference for c in costs]).T / [c.cost or np.nan for c in costs]
-    spread, places = 100.0 * np.abs([mean - low, high - mean]), np.arange(len(costs))
-    beside.axhline(0.0, color=BLUE, lw=1.6)
-    beside.errorbar(places, 100.0 * mean, yerr=spread, color=AGENT, marker="o", ms=5, capsize=3)
-    beside.set_xticks(places, [f"{c.price:.3g}" for c in costs])
-    cost = f"cost above the best rule's [%]\n(below 0: {lines[-1].label} is cheaper)"
-    beside.set(xlabel="price of a token", ylabel=cost)
-    save_figure(figure, path)
-
-
-def rules(path: Path, title: str, lines: Sequence[FigureLine], span: tuple[float, float]) -> None:
-    """Draw MSE against transmission rate, and each rule's cost at prices above the least cost."""
     figure, (front, costs) = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
-    colours = [f"C{place}" for place in range(len(lines))]
-    _draw_front(front, lines, colours)
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+    rest = itertools.cycle((BLUE, SKY, GREEN, PURPLE, ORANGE, BLACK))
+    colours = [AGENT if line.label[:4] in ("mode", "zoo:") else next(rest) for line in lines]
     prices = np.geomspace(*span, 40)
     means = [[(r.error_cost.mean(), r.tokens.mean()) for r in line.results] for line in lines]
     each = [(np.array(own) @ [np.ones(40), prices]).min(0) for own in means]
-    for own, colour in zip(each, colours, strict=True):
+    for line, own, colour in zip(lines, each, colours, strict=True):
+        _draw(front, line, colour)
         costs.plot(prices, 100.0 * (own / np.min(each, axis=0) - 1.0), color=colour)
-    label = "cost = error + price · tokens,\nabove the cheapest rule's [%]"
-    costs.set_xscale("log")
+    front.set(xlabel="transmissions per sensor and step", ylabel="mean squared error")
+    front.set_xlim(left=-0.005)
+    front.legend(fontsize=8, loc="upper right")
+    label = "cost = error + price · tokens,\nabove the least cost of all [%]"
+    costs.set(xscale="log", ylim=(-2, 60), xlabel="price of a token", ylabel=label)
     costs.xaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
-    costs.set(ylim=(-2, 60), xlabel="price of a token", ylabel=label)
+    errors = np.array([result.mse.mean() for line in lines for result in line.results])
+    if errors.max() > 6 * errors.min():
+        front.set_yscale("log")
+        front.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
     save_figure(figure, path)
-
-
-def _draw_front(axes: plt.Axes, lines: Sequence[FigureLine], colours: Sequence[str]) -> None:
-    for line, colour in zip(lines, colours, strict=True):
-        _draw(axes, line, colour)
-    axes.set(xlabel="transmissions per sensor and step", ylabel="mean squared error")
-    means = np.array([result.mse.mean() for line in lines for result in line.results])
-    if means.max() > 6 * means.min():
-        axes.set_yscale("log")
-        axes.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
-    axes.set_xlim(left=-0.005)
-    axes.legend(fontsize=8, loc="upper right")
 
 
 def plain_tick(value: float, place: float | None = None) -> str:

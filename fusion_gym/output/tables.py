@@ -1,6 +1,5 @@
 """Tables for the terminal."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -42,11 +41,6 @@ def table_number(interval: Mapping[str, float]) -> str:
 def difference(interval: Interval) -> str:
     """Return the mean and the ends of an interval with signs, as text."""
     return f"{interval.mean:+.4f} [{interval.low:+.4f}, {interval.high:+.4f}]"
-
-
-def share(value: float) -> str:
-    """Return a share in percent with its sign, as text; a share of nothing is a dash."""
-    return "–" if math.isnan(value) else f"{value:+.1%}"
 
 
 def evaluation_table(

@@ -45,6 +45,7 @@ from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 from stable_baselines3.dqn.policies import DQNPolicy
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
@@ -370,14 +371,17 @@ class ModelPolicy:
         owner = self.view.owner or "scheduler"
         self._layout = None if same else ObservationLayout(self.task, owner)
         self._memory: Any = None  # of a recurrent policy
+        self._stack: Any = None  # of an agent of several frames
+        self.frames = (model.observation_space.shape or (0,))[0] // self.view.space.shape[0]
         self.normalization: VecNormalize | None = None  # of the training
         self.offset = 0.0  # of the logarithms of thresholds
-        self.stateless = deterministic and not isinstance(model, RecurrentPPO)
+        stateful = isinstance(model, RecurrentPPO) or self.frames > 1
+        self.stateless = deterministic and not stateful
         self.knowledge: Knowledge = self.view.knowledge
         self.memory_owner = self.view.owner
         if isinstance(self.view.action, Threshold):  # the sensors' scores take part
             self.knowledge = least_covering((self.knowledge, self.view.action.score.knowledge))
-        if isinstance(model, RecurrentPPO) and self.knowledge != "centre":
+        if stateful and self.knowledge != "centre":
             self.knowledge = least_covering((self.knowledge, "own_memory"))
         span = self.task.reward.price.span
         self.price: float | None = None
@@ -393,8 +397,8 @@ class ModelPolicy:
             self.price = float(price_setting.encode(price_setting.draw(np.zeros(1)))[0])
 
     def reset(self, runs: int, seed: int = 0) -> None:
-        """Clear the memory of a recurrent policy, and draw from the stream of ``seed``."""
-        self._memory = None
+        """Clear the memory and the frames, and draw from the stream of ``seed``."""
+        self._memory = self._stack = None
         if not self.deterministic:
             self.model.set_random_seed(seed)
 
@@ -407,10 +411,16 @@ class ModelPolicy:
         masks = {}
         if isinstance(self.model, MaskablePPO):
             masks["action_masks"] = self.view.action.masks(signals["grantable"])
+        rows, start = self.rows(signals), signals["start"].repeat(self.view.rows_per_run)
+        if self.frames > 1:  # the present one comes last
+            if self._stack is None:
+                self._stack = np.zeros((len(rows), self.frames * rows.shape[1]), np.float32)
+            self._stack[start] = 0.0
+            rows = self._stack = np.concatenate((self._stack[:, rows.shape[1] :], rows), axis=1)
         action, self._memory = self.model.predict(
-            self.rows(signals),
+            rows,
             state=self._memory,
-            episode_start=signals["start"].repeat(self.view.rows_per_run),
+            episode_start=start,
             deterministic=self.deterministic,
             **masks,
         )
@@ -433,9 +443,15 @@ class ModelPolicy:
             rows = self.normalization.normalize_obs(rows)
         return rows
 
+    def refuse_frames(self) -> None:
+        """Refuse an agent of several frames."""
+        if self.frames > 1:
+            raise refusal("frames", self.frames, "1, an agent without VecFrameStack", "here")
+
     def check_logits(self) -> None:
         """Refuse an agent without one logit for each sensor."""
         action, model = self.view.action, self.model
+        self.refuse_frames()
         if isinstance(action, Threshold):
             return
         if isinstance(model, RecurrentPPO) or not hasattr(model.policy, "action_net"):
@@ -582,7 +598,9 @@ def _rebuilt(
     algorithm, arguments, shape, actions = read_declaration(data)
     weights = read_weights(file)
     action, view = _fitted(task, observed, shape, actions)
-    model = _model(algorithm, arguments, weights, view.space, view.action.space)
+    frames = shape[0] // view.space.shape[0]
+    space: Any = StackedObservations(1, frames, view.space).stacked_observation_space
+    model = _model(algorithm, arguments, weights, space, view.action.space)
     if algorithm == "dqn":  # its random decisions need the exploration rate
         rate = data.get("exploration_rate", 0.0)
         rate = validation.number("exploration_rate", rate, at_least=0.0, at_most=1.0)
@@ -651,7 +669,8 @@ def _fitted(
             f"has {len(view.names)}; missing are {missing[:4] or 'none'}, unknown to the model "
             f"{extra[:4] or 'none'}" + ("" if missing or extra else " (the order differs)")
         )
-    if shape != view.space.shape:
+    size = view.space.shape[0]
+    if len(shape) != 1 or shape[0] % size or (names is not None and shape[0] > size):
         raise ConfigurationError(
             f"{trained} shape {shape}, the task (information={task.options.information!r}) has "
             f"{view.space.shape}"

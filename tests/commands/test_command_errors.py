@@ -17,10 +17,8 @@ from hostile_folder import contents, scratch
 from paths import ROOT
 
 from fusion_gym.commands.command_line import Command
-from fusion_gym.core.reward import Price
 from fusion_gym.output.ending import report_errors
 from fusion_gym.policies.registry import parse_value
-from fusion_gym.training.config import SweepCurve
 from fusion_gym.validation import ConfigurationError
 
 PER_OPTION = 2  # of the tries that run each time
@@ -154,11 +152,6 @@ def test_output_that_nobody_reads_or_takes() -> None:
 @pytest.mark.parametrize("text", ["{[]: 1}", "(" * 5000, "9" * 5000 + "x", "\0"])
 def test_what_is_no_literal_stays_text(text: str) -> None:
     assert parse_value(text) == text
-
-
-def test_braces_of_a_swept_policy_are_its_own() -> None:
-    curve = SweepCurve(label="a", policy="p:a={value},b={0}{other}", values=(1, 2.5))
-    assert curve.policies(Price.create(0.5)) == ["p:a=1,b={0}{other}", "p:a=2.5,b={0}{other}"]
 
 
 @pytest.mark.parametrize("option", ["--error-code", "--error_code", "--channels"])

@@ -89,21 +89,25 @@ def test_compare_asks_the_rule_at_every_price() -> None:
         "output": "unused",
     }
     Path("training.yaml").write_text(yaml.safe_dump(training))
-    Path("sweep.yaml").write_text(yaml.safe_dump({"points": ["never", "always"], "curves": []}))
     sizes = ["--prices", "2", "--generations", "1"]
     line = succeed("search", ["--config", "training.yaml", "--output", "made", *sizes, *LOCAL])
     policy = line.out.splitlines()[0]
     assert policy.startswith("priced_threshold:own=true,score=innovation,")
     assert contents("made")[1]["prices"] == [0.5, 2.0]
-    files = ["--config", "training.yaml", "--sweep", "sweep.yaml", "--episodes", "4"]
-    succeed("compare", [*files, "--policy", policy, "--prices", "3", "--output", "compared"])
-    points = json.loads(Path("compared/comparison.json").read_text())["points"]
-    assert [point["at_price"]["price"] for point in points] == [0.5, 1.0, 2.0]
-    assert points[0]["rate"] >= points[-1]["rate"]
+    files = ["--config", "training.yaml", "--episodes", "4", "--prices", "3"]
+    succeed("compare", [*files, "--policies", policy, "never", "--output", "compared"])
+    rows = json.loads(Path("compared/comparison.json").read_text())["prices"]
+    assert [row["price"] for row in rows] == [0.5, 1.0, 2.0]
+    evaluated = json.loads(Path("compared/evaluation.json").read_text())["policies"]
+    settings = policy.partition(":")[2]
+    rates = [sum(own["rate"]) for text, own in evaluated.items() if text.endswith(settings)]
+    assert len(rates) > 3
+    assert rates[0] > rates[-1]
     based = "rollout:samples=2,base=value_of_information:threshold=0.1"
-    succeed("compare", [*files, "--policy", based, "--prices", "2", "--output", "based"])
-    message = refusal("compare", [*files, "--policy", "always", "--prices", "3", "--output", "x"])
-    assert "prices = 3 is not allowed: it must be left out with policy = 'always'" in message
+    succeed("compare", [*files, "--policies", based, "never", "--output", "based"])
+    evaluated = json.loads(Path("based/evaluation.json").read_text())["policies"]
+    prices = [text.partition("price=")[2].partition(",")[0] for text in evaluated]
+    assert prices == ["0.5", "1.0", "2.0", ""]
 
 
 @pytest.mark.slow

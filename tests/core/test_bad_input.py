@@ -195,6 +195,8 @@ CALLS: list[tuple[Any, ...]] = [
     (lambda: make_vector(render_mode="human"), "render_mode = 'human'"),
     (lambda: make_sb3_vec_env(ENV_ID, 2, stagger=1), "stagger = 1", "True or False"),
     (lambda: make_sb3_vec_env(ENV_ID, 2, reward="vector"), "reward = 'vector'"),
+    (lambda: make_sb3_vec_env(ENV_ID, 2, render_mode="human"), "render_mode = 'human'"),
+    (lambda: make_sb3_vec_env(ENV_ID, 2, wrapper_class=dict), "wrapper_class", "a VecEnvWrapper"),
     (lambda: parallel_env(ENV_ID, reward="vector"), "reward = 'vector'"),
     (lambda: gymnasium.make(ENV_ID).reset(options={"phase": 1}), "'phase'"),
     (lambda: make_vector().reset(options=["reset_mask"]), "options = ['reset_mask']"),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
+from fusion_gym import make_sb3_vec_env
 from fusion_gym.envs.registration import ENVIRONMENTS
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
@@ -94,13 +95,21 @@ def test_recorders_write_films(tmp_path: Path) -> None:
         env.step(env.action_space.sample())
     env.close()
     assert list((tmp_path / "gym").glob("*.mp4"))
-    rows = make_vec_env(TOBIT, n_envs=2, env_kwargs={"horizon": 5})
-    film = VecVideoRecorder(rows, str(tmp_path / "sb3"), lambda step: step == 0, video_length=3)
-    film.reset()
-    for _ in range(4):
-        film.step(np.ones((2, 3), dtype=np.int8))
-    film.close()
-    assert list((tmp_path / "sb3").glob("*.mp4"))
+    native: Any = make_sb3_vec_env(TOBIT, 2, horizon=5, render_mode="rgb_array")
+    singles: Any = make_vec_env(TOBIT, n_envs=2, env_kwargs={"horizon": 5})
+    pictures: dict[str, Any] = {}
+    for name, rows in (("native", native), ("singles", singles)):
+        rows.seed(0)
+        film = VecVideoRecorder(rows, str(tmp_path / name), lambda step: step == 0, video_length=3)
+        film.reset()
+        for _ in range(7):  # beyond the end of an episode
+            film.step(np.ones((2, 3), dtype=np.int8))
+        pictures[name] = rows.get_images()
+        film.close()
+        assert list((tmp_path / name).glob("*.mp4"))
+    assert [p.shape for p in pictures["native"]] == [p.shape for p in pictures["singles"]]
+    assert (pictures["native"][0] != pictures["native"][1]).any()
+    assert make_sb3_vec_env(TOBIT, 2, horizon=5).render_mode is None
 
 
 def test_a_window_shows_the_episode() -> None:

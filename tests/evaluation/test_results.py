@@ -4,15 +4,14 @@ import copy
 import json
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+import numpy as np
 import pytest
-from command_runs import call, refusal, succeed
+from command_runs import call, refusal
 
-from fusion_gym.commands.compare import Point, _label, price_table, rate_table
+from fusion_gym.commands.compare import cell, short_text
 from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.curves import compare
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.metrics import compare_at_price, compare_with_envelope
-from fusion_gym.output import figures
 from fusion_gym.policies.registry import make_policy
 
 ENV = "fusion_gym/TobitOscillator-v1"
@@ -44,35 +43,21 @@ def test_no_error_at_all_can_be_compared() -> None:
     """Over a perfect channel whoever always transmits has none: no share of it."""
     task = make_task("fusion_gym/RemoteEstimation-v1", horizon=3)
     results = run_episodes(task, make_policy("always", task), 2, 0)
-    every = {"always": results}
-    at_price, at_rate = compare_at_price(results, every, 0.0), compare_with_envelope(results, every)
-    point = Point("always", 1.0, 0.0, at_price, at_rate)
-    assert list(rate_table([point]).columns[5].cells) == ["–"]
-    assert list(price_table([point], every).columns[6].cells) == ["–"] * 2
+    compared = compare({"always": results.mse, "same": results.mse, "absent": None})
+    assert [cell(own) for own in compared.values()] == ["0", "0", "–"]
 
 
-@pytest.mark.slow
-def test_a_rule_is_compared_under_its_name_in_few_curves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No word of an agent; a title in words and at most six curves, of the sweep's fourteen."""
-    drawn: list[plt.Figure] = []
-    monkeypatch.setattr(figures, "save_figure", lambda figure, *_: drawn.append(figure))
-    words = ["--config", "tobit_oscillator_ppo", "--sweep", "tobit_oscillator_sweep"]
-    words += ["--policy", "innovation_threshold:threshold=1", "--episodes", "3"]
-    printed = succeed("compare", [*words, "--output", str(tmp_path)])
-    (figure,) = drawn
-    labels = [str(curve.get_label()) for axes in figure.axes for curve in axes.containers]
-    assert 3 <= len(labels) <= 6
-    assert "innovation_threshold" in labels
-    rest = "innovation_threshold against the best rule at the same price"
-    assert figure.get_suptitle() == f"Tobit oscillator, 3 sensors: {rest}"
-    assert "agent" not in " ".join([printed.out, printed.err, *labels])
-    *_, last = filter(str.strip, printed.out.splitlines())
-    assert last.split()[:4] == ["innovation_threshold,", "mean", "over", "prices"]
+def test_a_difference_is_to_the_best_other_policy() -> None:
+    samples = {"a": np.array([1.0, 3.0]), "b": np.array([4.0, 4.0]), "c": np.array([3.0, 3.0])}
+    compared = compare(samples)
+    shares = {name: own.relative.mean for name, own in compared.items() if own}
+    assert shares == pytest.approx({"a": 2 / 3 - 1, "b": 1.0, "c": 0.5})
+    assert compared["c"] is not None
+    low, high = compared["c"].difference[1:]
+    assert (low, high) == (0.0, 2.0)
+    assert "+100.0%" in cell(compared["b"])
 
 
-def test_saved_agents_alone_are_called_agents() -> None:
-    assert _label("zoo:tobit_oscillator_centre") == _label("model:a.zip") == "the agent"
-    assert _label("model:runs/calibrated_model.zip,price=1") == "the calibrated agent"
-    assert _label("my_rules:Mine") == "my_rules:Mine"
+def test_a_file_is_named_without_its_folder() -> None:
+    assert short_text("model:runs/front/a.zip,price=1") == "model:a.zip,price=1"
+    assert short_text("my/rules:Mine") == "my/rules:Mine"

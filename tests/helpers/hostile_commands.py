@@ -42,8 +42,8 @@ BASES: dict[str, dict[str, list[str]]] = {
         "json": ["made.json"],
     },
     "compare": {
-        "config": ["training.yaml"], "sweep": ["sweep.yaml"], "policy": ["always"],
-        "output": ["made"], "episodes": ["2"],
+        "config": ["training.yaml"], "policies": ["always"], "output": ["made"],
+        "episodes": ["2"],
     },
     "calibrate": {
         "env": [ENV], "policy": ["zoo:tobit_oscillator_scheduler"], "output": ["made.zip"],
@@ -146,7 +146,7 @@ def hostile(option: str, kind: Any, present: list[str] | None = None) -> list[st
         values = POLICIES
     elif option == "set":
         values = SETTINGS
-    elif option in ("config", "sweep"):
+    elif option == "config":
         values = [*UNREADABLE, *(f"{name}.yaml" for name in BROKEN)]
     elif "Path" in text:
         values = [*UNREADABLE, *results]

@@ -14,10 +14,6 @@ TRAINING = {
     "validation": {"every": 32, "episodes": 2},
     "output": "made",
 }
-SWEEP = {
-    "points": ["never", "always"],
-    "curves": [{"label": "a", "policy": "periodic:period={value}", "values": [2, 3]}],
-}
 ROWS = {"environment": ENV, "rows": [{"label": "a", "policy": "always"}]}
 BROKEN: dict[str, bytes] = {
     "empty": b"",
@@ -52,7 +48,7 @@ BROKEN: dict[str, bytes] = {
 
 def scratch(folder: Path) -> None:
     """A folder with what the tries need, where everybody may write."""
-    configs = {"training": TRAINING, "sweep": SWEEP, "rows": ROWS}
+    configs = {"training": TRAINING, "rows": ROWS}
     for name, content in configs.items():
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
     for name, raw in BROKEN.items():

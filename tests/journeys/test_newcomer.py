@@ -4,20 +4,15 @@ import json
 import re
 import shlex
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from command_runs import refusal, succeed
 from paths import ROOT
-from refusals import refused
 
 from benchmarks.newcomer import replaced, run
-from fusion_gym.commands.compare import Compare
-from fusion_gym.envs.registration import make_task
 from fusion_gym.training.config import Experiment, load_checked
-from fusion_gym.validation import ConfigurationError
 
 PAGE = (ROOT / "docs" / "newcomer.md").read_text()
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
@@ -49,8 +44,11 @@ def test_the_lines_of_the_page_lead_to_a_front(
         if name == "evaluate":
             assert "kitchen" in ended.out
     assert (tmp_path / "runs/rooms/comparison/pareto.png").stat().st_size > 20_000
-    points = json.loads((tmp_path / "runs/rooms/comparison/comparison.json").read_text())["points"]
-    prices = [float(point["policy"].partition("price=")[2]) for point in points]
+    compared = json.loads((tmp_path / "runs/rooms/comparison/comparison.json").read_text())
+    prices = [row["price"] for row in compared["prices"]]
+    evaluated = json.loads((tmp_path / "runs/rooms/comparison/evaluation.json").read_text())
+    agent = [text for text in evaluated["policies"] if text.startswith("model:")]
+    assert [float(text.partition("price=")[2]) for text in agent] == prices
     # The plant of the file belongs to the training, wherever the file has gone.
     content = yaml.safe_load((tmp_path / "runs/rooms/front/config.yaml").read_text())["environment"]
     options = content["options"]
@@ -66,28 +64,6 @@ def test_the_lines_of_the_page_lead_to_a_front(
     error = refusal("train", [*same, "system=rooms.yaml", "--resume", "--timesteps", "4096"])
     assert "environment" in error
     assert "transition" in error
-
-
-def front(**options: Any) -> Any:
-    experiment = load_checked(Experiment, "linear_fusion_front").changed(None, options)
-    return make_task(experiment.environment.id, **experiment.environment.options)
-
-
-def requests_at(policy: str, prices: int | None) -> Compare:
-    return Compare(config="a", sweep="b", policy=policy, output=Path("c"), prices=prices)
-
-
-def test_prices_are_for_agents_that_see_one() -> None:
-    task = front(price_range=[0.01, 1.0])
-    assert list(requests_at("always", None).policies_of(task).values()) == pytest.approx([0.1])
-    assert requests_at("model:a.zip", 3).policies_of(task) == {
-        "model:a.zip,price=0.01": 0.01, "model:a.zip,price=0.1": 0.1, "model:a.zip,price=1.0": 1.0
-    }  # fmt: skip
-    narrow = front(price_range=[0.0123456789, 0.2])
-    assert min(requests_at("zoo:x", 2).policies_of(narrow)) == "zoo:x,price=0.0123456789"
-    refused(lambda: requests_at("always", 3).policies_of(task), "prices = 3", "takes no price")
-    with pytest.raises(ConfigurationError, match=r"prices = 3 .* no price_range"):
-        requests_at("model:a.zip", 3).policies_of(make_task("fusion_gym/LinearFusion-v2"))
 
 
 def test_tables_go_between_their_marks() -> None:

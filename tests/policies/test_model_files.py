@@ -395,10 +395,6 @@ def test_commands_load_foreign_code_with_trust_alone(tmp_path: Path) -> None:
             "training": {"timesteps": 64},
             "output": "unused",
         },
-        "sweep": {
-            "points": ["never", "always", policy],
-            "curves": [{"label": "a", "policy": "paced:rate={value}", "values": [0.1, 0.5]}],
-        },
         "rows": {
             "environment": ENV,
             "rows": [{"label": "a", "policy": policy, "options": OPTIONS}],
@@ -406,8 +402,8 @@ def test_commands_load_foreign_code_with_trust_alone(tmp_path: Path) -> None:
     }
     for name, content in files.items():
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
-    config, sweep = str(tmp_path / "config.yaml"), str(tmp_path / "sweep.yaml")
-    compared = ["--config", config, "--sweep", sweep, "--policy", policy]
+    config = str(tmp_path / "config.yaml")
+    compared = ["--config", config, "--policies", "never", policy]
     compared += ["--output", str(tmp_path / "comparison")]
     for command, arguments in (
         ("evaluate", ["--config", config, "--policies", policy]),

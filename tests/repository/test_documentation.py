@@ -78,7 +78,7 @@ def test_a_question_is_two_clicks_from_the_readme(question: str) -> None:
 
 
 def test_configs_that_the_texts_name_exist() -> None:
-    configs = re.findall(r"(?:--config|--sweep) (\w+)(?![\w/]|\.yaml)", TEXTS)
+    configs = re.findall(r"--config (\w+)(?![\w/]|\.yaml)", TEXTS)
     assert configs
     missing = [name for name in configs if not (ROOT / f"configs/{name}.yaml").exists()]
     assert not missing

@@ -49,7 +49,7 @@ LISTED = (
     Listed("pip install ", "downloads: its extras are looked for in the wheel"),
     Listed("fusion-gym train --config tobit_oscillator_front", "minutes"),
     Listed("fusion-gym train ", "minutes", "--timesteps 1024"),
-    Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
+    Listed("fusion-gym compare ", "minutes", "--episodes 4"),
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
     Listed("fusion-gym calibrate ", "needs a training of minutes"),
@@ -71,9 +71,8 @@ for place, folder, (program, name, *words) in json.loads(sys.stdin.read()):
         with contextlib.redirect_stderr(said):
             given = read_command(load(name))
             check_options(given)
-            for option in ("config", "sweep"):
-                if getattr(given, option, None) is not None:
-                    read_text(option, config_path(getattr(given, option), option))
+            if getattr(given, "config", None) is not None:
+                read_text("config", config_path(given.config))
     except (Exception, SystemExit) as error:
         print(f"{place}: {error} {said.getvalue()}")
 """
