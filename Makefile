@@ -104,7 +104,7 @@ integrations: .venv-light/.installed  ## other libraries: SB3, rl-zoo3, TorchRL,
 integrations-tianshou: .venv-tianshou/.installed  ## Tianshou
 	.venv-tianshou/bin/python -m pytest integrations/tianshou
 
-integrations-rejax: .venv-rejax/.installed  ## rejax
+integrations-rejax: .venv-rejax/.installed  ## rejax, Minari
 	.venv-rejax/bin/python -m pytest integrations/rejax
 
 integrations-rllib: .venv-rllib/.installed  ## RLlib

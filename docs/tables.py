@@ -6,6 +6,7 @@
 import inspect
 import pydoc
 import re
+import statistics
 import sys
 import warnings
 from pathlib import Path
@@ -18,7 +19,7 @@ from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in, short
 from fusion_gym.envs.registration import ENVIRONMENTS, make_task, options_of
-from fusion_gym.envs.returns import read_returns, reward_threshold
+from fusion_gym.envs.returns import returns_of, reward_threshold, share_text
 from fusion_gym.envs.views import make_view
 from fusion_gym.errors import ConfigurationError
 from fusion_gym.evaluation.metrics import metric_table
@@ -186,7 +187,7 @@ def return_table(text: str) -> str:
     for env_id in ENVIRONMENTS:
         name, task = env_id.rpartition("/")[2], make_task(env_id)
         paper, bucket = _PAPERS.get(pages_of[name]), task.network.bucket
-        means = {row.kind: row.mean for row in read_returns() if row.environment == env_id}
+        means = {kind: statistics.median(own) for kind, own in returns_of(env_id).items()}
         means["tuned rule"] = reward_threshold(env_id) or 0.0
         cells = (f"{means[kind]:.4g}".replace("-", "−") if kind in means else "–" for kind in kinds)
         rows.append((
@@ -199,12 +200,26 @@ def return_table(text: str) -> str:
     return table(("environment", "paper", "action", "tokens", *kinds), rows)
 
 
+def share_table(text: str) -> str:
+    """Return which share of the gap to the best threshold learners close in each environment.
+
+    Args:
+        text: the kinds of learners, separated by semicolons.
+    """
+    kinds = [kind.strip() for kind in text.split(";")]
+    rows = (
+        (f"`{env_id.rpartition('/')[2]}`", *(share_text(env_id, kind) for kind in kinds))
+        for env_id in ENVIRONMENTS
+    )
+    return table(("environment", *kinds), rows)
+
+
 TABLES = {
     "access": access_table, "algorithms": algorithm_table, "facts": fact_table,
     "filters": filter_table, "fusion": fusion_table, "metrics": metric_table, "names": name_table,
     "networks": network_table,
     "observation": observation_table, "options": option_table, "policies": policy_table,
-    "returns": return_table,
+    "returns": return_table, "shares": share_table,
 }  # fmt: skip
 PART = re.compile(r"(?ms)^(<!-- table: (\w+)\s([^>]+?)\s-->\n).*?^(<!-- end -->)$")
 

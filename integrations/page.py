@@ -1,4 +1,4 @@
-"""The blocks of docs/other_libraries.md, run as a reader would run them."""
+"""The blocks of docs/other_libraries.md and docs/recipes.md, run as a reader would run them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
-PAGE = (ROOT / "docs" / "other_libraries.md").read_text(encoding="utf-8")
+PAGES = [ROOT / "docs" / name for name in ("other_libraries.md", "recipes.md")]
+PAGE = "".join(path.read_text(encoding="utf-8") for path in PAGES)
 
 
 def section(library: str) -> str:
@@ -20,7 +21,7 @@ def run(library: str) -> dict[str, Any]:
     """Run a library's block as a script; returns its names."""
     (code,) = re.findall(r"^```py(?:thon)?\n(.*?)^```", section(library), re.DOTALL | re.MULTILINE)
     names: dict[str, Any] = {"__name__": "__main__"}
-    exec(compile(code, f"docs/other_libraries.md, {library}", "exec"), names)
+    exec(compile(code, f"docs, {library}", "exec"), names)
     return names
 
 
