@@ -11,7 +11,7 @@ QUICK  := tests/laws/test_interfaces.py tests/core/test_bad_input.py tests/envs/
 	tests/training/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
 	tests/journeys/test_newcomer.py tests/journeys/test_field_study.py
 
-.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers papers-check zoo newcomer pages docs integrations \
+.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers papers-check zoo pages docs integrations \
 	integrations-tianshou integrations-rejax integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
@@ -121,9 +121,6 @@ papers-check: $(STAMP)  ## the papers' verdicts from a tenth of the episodes, ag
 
 zoo: $(STAMP)  ## the best learned policies of the benchmark: fusion_gym/zoo/
 	$(BIN)/python -m agents.zoo
-
-newcomer: $(STAMP)  ## run the commands of docs/newcomer.md and write its tables, 6 minutes
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.newcomer
 
 lines:  ## code lines without blanks, comments and docstrings
 	@$(PYTHON) tests/repository/lines.py

@@ -19,7 +19,7 @@ import tyro
 from rich.progress import track
 
 import fusion_gym
-from benchmarks.newcomer import replaced
+from benchmarks.throughput import replaced
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.docstrings import table

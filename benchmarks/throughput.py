@@ -9,6 +9,7 @@ docs/speed.md.
 
 import itertools
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -30,7 +31,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import fusion_gym
 import fusion_gym.jax
-from benchmarks.newcomer import replaced
 from fusion_gym.docstrings import table
 from fusion_gym.entries import Options
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
@@ -251,6 +251,12 @@ def main(seconds: float = 0.1, page: bool = False) -> None:
         content = replaced(PAGE.read_text(encoding="utf-8"), "throughput", text)
         PAGE.write_text(content, encoding="utf-8")
     Console(width=150).print(Markdown(text))
+
+
+def replaced(text: str, name: str, content: str) -> str:
+    """Return the page with new content between the marks of this name."""
+    pattern = re.compile(rf"(<!-- table: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+    return pattern.sub(lambda mark: f"{mark[1]}\n{content}\n\n{mark[2]}", text)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from fusion_gym.evaluation.episodes import (
 from fusion_gym.evaluation.metrics import (
     EnvelopePoint,
     Interval,
-    compare_with_envelope,
+    envelope_error,
     lower_envelope,
     mean_interval,
     paired_difference,
@@ -24,7 +24,7 @@ __all__ = [
     "EpisodeResults",
     "Interval",
     "Trajectory",
-    "compare_with_envelope",
+    "envelope_error",
     "lower_envelope",
     "make_policy",
     "mean_interval",

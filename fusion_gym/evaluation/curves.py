@@ -12,7 +12,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Plain
 from fusion_gym.evaluation.episodes import EpisodeResults
-from fusion_gym.evaluation.metrics import Interval, lower_envelope, mean_interval, mixture
+from fusion_gym.evaluation.metrics import Interval, envelope_error, mean_interval
 from fusion_gym.evaluation.rule_search import try_thresholds
 from fusion_gym.policies.base import SHARED_THRESHOLD, SearchRange
 from fusion_gym.policies.registry import (
@@ -115,10 +115,8 @@ def compare(samples: Mapping[str, Array | None]) -> dict[str, Comparison | None]
 
 def error_at_rate(curve: Curve, rate: float) -> Array | None:
     """Return the MSE (E,) of the curve's lower envelope at a rate, ``None`` to its left."""
-    shares = mixture(lower_envelope(curve), rate)
-    if shares is None:
-        return None
-    return np.asarray(sum(share * curve[name].mse for name, share in shares.items()))
+    least = min(float(item.rate.mean()) for item in curve.values())
+    return envelope_error(curve, rate) if rate >= least else None
 
 
 def cost_at_price(curve: Curve, price: float) -> Array:

@@ -1,7 +1,7 @@
 """Metrics of episodes with bootstrap intervals over episodes, and comparisons of policies."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -256,9 +256,6 @@ def check_pair(results: EpisodeResults, reference: EpisodeResults) -> None:
         )
 
 
-FAR_APART = 1.5
-
-
 class EnvelopePoint(NamedTuple):
     """A policy on the envelope, with its means over episodes.
 
@@ -312,85 +309,40 @@ def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]
     return [points[place] for place in lower_hull(rates, errors)]
 
 
-def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | None:
-    """Return the shares of policies of an envelope at a rate; ``None`` to the left of it."""
-    if rate < hull[0].rate:
-        return None
-    left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)
-    right = min((p for p in hull if p.rate > rate), key=lambda p: p.rate, default=None)
-    if right is None:
-        return {left.name: 1.0}
-    share = (rate - left.rate) / (right.rate - left.rate)
-    return {left.name: 1.0 - share, right.name: share}
+def envelope_error(results: Mapping[str, EpisodeResults], rate: float) -> Array:
+    """Return the MSE of each episode on the policies' lower envelope at a rate.
 
-
-class BaselineComparison(NamedTuple):
-    """A policy against the envelope at the policy's rate, over paired episodes.
+    The two neighbours on the envelope are mixed to the rate. To its right the last one counts. A
+    policy whose rate lies between distant neighbours may lie below the line.
 
     Args:
-        difference: MSE of the policy minus MSE of the envelope, with its interval.
-        envelope: MSE of the envelope at this rate.
-        between: the policies of the mixture.
-        far_apart: whether their rates differ by more than the factor ``FAR_APART``; a policy with a
-            rate between them may lie below the line.
-    """
-
-    difference: Interval
-    envelope: float
-    between: tuple[str, ...]
-    far_apart: bool = False
-
-
-def compare_with_envelope(
-    results: EpisodeResults, baselines: Mapping[str, EpisodeResults]
-) -> BaselineComparison:
-    """Return the paired difference of the MSE to the baselines' lower envelope.
-
-    The envelope is taken at the mean rate of the policy. Negative: the policy is better.
-
-    Args:
-        results: results of the policy.
-        baselines: results of the baselines by name, on the same episodes.
+        results: results of each policy by name, on the same episodes.
+        rate: transmissions per sensor and step.
 
     Returns:
-        The difference with its interval, the envelope's MSE and the mixed policies.
+        The errors (E,). ``results.mse - envelope_error(…)`` are paired differences.
 
     Raises:
-        ConfigurationError: no baselines, another number of episodes, or a rate below the rates of
-            all baselines.
+        ConfigurationError: no policies, or a rate below the rates of all.
 
     Example:
         >>> from fusion_gym import make_policy, make_task
-        >>> from fusion_gym.evaluation import compare_with_envelope, run_episodes
+        >>> from fusion_gym.evaluation import envelope_error, mean_interval, run_episodes
         >>> task = make_task("fusion_gym/TobitOscillator-v1", horizon=20)
         >>> names = ["never", "always", "periodic:period=8"]
         >>> results = {n: run_episodes(task, make_policy(n, task), 8, seed=0) for n in names}
-        >>> comparison = compare_with_envelope(results.pop("periodic:period=8"), results)
-        >>> round(comparison.difference.mean, 3), comparison.between
-        (-0.011, ('never', 'always'))
+        >>> mine = results.pop("periodic:period=8")
+        >>> error = envelope_error(results, float(mine.rate.mean()))
+        >>> round(mean_interval(mine.mse - error).mean, 3)
+        -0.011
     """
-    _check_pairs(results, baselines)
-    hull = lower_envelope(baselines)
-    rate = float(results.rate.mean())
-    shares = mixture(hull, rate)
-    if shares is None:
+    hull = lower_envelope(results)
+    if rate < hull[0].rate:
         raise ConfigurationError(
-            f"rate = {rate:.4f} is below every baseline's (the smallest is {hull[0].rate:.4f}): "
-            "add 'never' to the baselines"
+            f"rate = {rate:.4f} is below every policy's (the smallest is {hull[0].rate:.4f}): "
+            "add 'never'"
         )
-    envelope = np.asarray(sum(share * baselines[name].mse for name, share in shares.items()))
-    between = tuple(name for name, share in shares.items() if share > 0.0)
-    rates = [float(baselines[name].rate.mean()) for name in between]
-    return BaselineComparison(
-        difference=mean_interval(results.mse - envelope),
-        envelope=float(envelope.mean()),
-        between=between,
-        far_apart=max(rates) > FAR_APART * min(rates),
-    )
-
-
-def _check_pairs(results: EpisodeResults, baselines: Mapping[str, EpisodeResults]) -> None:
-    if not baselines:
-        raise ConfigurationError("policies = {} is not allowed: at least one baseline is needed")
-    for item in baselines.values():
-        check_pair(results, item)
+    left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)
+    right = min((p for p in hull if p.rate > rate), key=lambda p: p.rate, default=left)
+    share = (rate - left.rate) / (right.rate - left.rate or 1.0)
+    return np.asarray((1.0 - share) * results[left.name].mse + share * results[right.name].mse)

@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from linear_case import Linear
 from refusals import refused
 
-from fusion_gym import ConfigurationError, make_task
+from fusion_gym import make_task
 from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.errors import DivergenceError
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode, run_episodes
 from fusion_gym.evaluation.metrics import (
     METRICS,
-    compare_with_envelope,
+    envelope_error,
     lower_envelope,
     mean_interval,
     paired_difference,
@@ -259,16 +259,13 @@ def test_comparison_mixes_episode_by_episode(
     noise -= noise.mean(1, keepdims=True)
     baselines = {name: fake(mse + noise[i], r) for i, (name, (r, mse)) in enumerate(cloud.items())}
     hull = lower_envelope(baselines)
-    policy = fake(2.0 + noise[12], rate / 20)
-    if rate / 20 < hull[0].rate - 1e-12:
-        refused(lambda: compare_with_envelope(policy, baselines), "below every baseline")
+    own_rate = float(fake(noise[12], rate / 20).rate.mean())
+    if own_rate < hull[0].rate:
+        refused(lambda: envelope_error(baselines, own_rate), "below every policy")
         return
-    result = compare_with_envelope(policy, baselines)
-    expected = envelope_at(hull, rate / 20)
-    assert result.envelope == pytest.approx(expected)
-    assert result.difference.mean == pytest.approx(2.0 - expected)
-    assert 1 <= len(result.between) <= 2
-    assert set(result.between) <= {point.name for point in hull}
+    error = envelope_error(baselines, own_rate)
+    assert error.mean() == pytest.approx(envelope_at(hull, own_rate))
+    assert min(np.ptp(error - own.mse) for own in baselines.values()) < np.ptp(noise)
 
 
 def test_envelope_by_hand() -> None:
@@ -277,18 +274,12 @@ def test_envelope_by_hand() -> None:
     baselines |= {"always": fake([1.0, 1.0], 1.0), "wasteful": fake([1.5, 1.5], 1.0)}
     hull = lower_envelope(baselines)
     assert [point.name for point in hull] == ["never", "good", "always"]
-    # At a rate of 0.1 three quarters never and one quarter good: 6.75 and 3.25
-    result = compare_with_envelope(fake([6.0, 3.0], 0.1), baselines)
-    assert result.between == ("never", "good")
-    assert result.difference.low >= -0.75 - 1e-12
-    assert result.difference.high <= -0.25 + 1e-12
-    # Exactly at a policy of the envelope, that policy alone
-    result = compare_with_envelope(fake([3.0, 1.0], 0.4), baselines)
-    assert result.between == ("good",)
-    assert result.difference == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
-    with pytest.raises(ConfigurationError, match="add 'never'"):
-        compare_with_envelope(fake([1.0, 1.0], 0.1), {"always": baselines["always"]})
-    refused(lambda: compare_with_envelope(fake([1.0, 1.0, 1.0], 0.4), baselines), "paired")
+    # At a rate of 0.1 three quarters never and one quarter good
+    np.testing.assert_allclose(envelope_error(baselines, 0.1), [6.75, 3.25])
+    # Exactly at a policy of the envelope, that policy alone, and the last one to its right
+    np.testing.assert_allclose(envelope_error(baselines, 0.4), [3.0, 1.0])
+    np.testing.assert_array_equal(envelope_error(baselines, 1.5), [1.0, 1.0])
+    refused(lambda: envelope_error({"always": baselines["always"]}, 0.1), "add 'never'")
     refused(lambda: lower_envelope({}), "at least one")
 
 

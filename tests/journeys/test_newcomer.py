@@ -11,7 +11,6 @@ import yaml
 from command_runs import refusal, succeed
 from paths import ROOT
 
-from benchmarks.newcomer import replaced, run
 from fusion_gym.training.config import Experiment, load_checked
 
 PAGE = (ROOT / "docs" / "newcomer.md").read_text()
@@ -54,7 +53,7 @@ def test_the_lines_of_the_page_lead_to_a_front(
     options = content["options"]
     assert options.pop("reward_scale") > 0.0
     low, high = options.pop("price_range")
-    np.testing.assert_allclose(prices, np.geomspace(low, high, 7), rtol=1e-3)
+    np.testing.assert_allclose(prices, np.geomspace(low, high, 5), rtol=1e-3)
     assert (prices[0], prices[-1]) == (low, high)
     assert options == {
         "memory": True, "cost_weight": "random", "horizon": 8, **yaml.safe_load(text)
@@ -64,21 +63,6 @@ def test_the_lines_of_the_page_lead_to_a_front(
     error = refusal("train", [*same, "system=rooms.yaml", "--resume", "--timesteps", "4096"])
     assert "environment" in error
     assert "transition" in error
-
-
-def test_tables_go_between_their_marks() -> None:
-    text = "a\n<!-- table: x -->\nold\n<!-- end -->\n<!-- table: y -->\n<!-- end -->\n"
-    once = replaced(text, "x", "| new |")
-    assert once == replaced(once, "x", "| new |")
-    assert "old" not in once
-    assert once.endswith("<!-- table: y -->\n<!-- end -->\n")
-
-
-def test_a_command_that_has_ended_is_not_run_again(tmp_path: Path) -> None:
-    first = run("python -c 'print(1)'", tmp_path)
-    assert run("python -c 'print(1)'", tmp_path) == first
-    with pytest.raises(RuntimeError, match="ended with 3"):
-        run("python -c 'raise SystemExit(3)'", tmp_path)
 
 
 def test_many_sensors_train_shorter() -> None:

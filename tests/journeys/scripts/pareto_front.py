@@ -18,5 +18,6 @@ for name, rate, mse in fusion_gym.evaluation.lower_envelope(rules):
     print(f"{rate:.3f}  {mse:.3f}  {name}")
 for price in (0.02, 0.2, 2.0):
     results = run(f"zoo:{agent},price={price}")
-    found = fusion_gym.evaluation.compare_with_envelope(results, rules)
-    print(f"{results.rate.mean():.3f}  {results.mse.mean():.3f}  price {price}", found.difference)
+    error = fusion_gym.evaluation.envelope_error(rules, results.rate.mean())
+    difference = fusion_gym.evaluation.mean_interval(results.mse - error)
+    print(f"{results.rate.mean():.3f}  {results.mse.mean():.3f}  price {price}", difference)
