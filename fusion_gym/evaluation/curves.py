@@ -105,12 +105,17 @@ class Comparison(NamedTuple):
 def compare(samples: Mapping[str, Array | None]) -> dict[str, Comparison | None]:
     """Return the comparison of policies by their samples, one per episode."""
     known: dict[str, Any] = {name: own for name, own in samples.items() if own is not None}
-    order = sorted(known, key=lambda name: float(known[name].mean()))
+    order = sorted(known, key=lambda name: _mean(known[name]))
     result: dict[str, Comparison | None] = dict.fromkeys(samples)
     for name, own in known.items():
         least = known[next((other for other in order if other != name), name)]
-        result[name] = Comparison(float(own.mean()), mean_interval(own - least))
+        result[name] = Comparison(_mean(own), mean_interval(own - least))
     return result
+
+
+def _mean(samples: Array) -> float:
+    """Return the mean without lost episodes."""
+    return float(np.nanmean(samples))
 
 
 def error_at_rate(curve: Curve, rate: float) -> Array | None:
@@ -121,11 +126,11 @@ def error_at_rate(curve: Curve, rate: float) -> Array | None:
 
 def cost_at_price(curve: Curve, price: float) -> Array:
     """Return the cost (E,) of the curve's policy that costs least at a price of a token."""
-    return min((item.cost(price) for item in curve.values()), key=lambda cost: float(cost.mean()))
+    return min((item.cost(price) for item in curve.values()), key=_mean)
 
 
 def usual_prices(task: Task, results: Curve) -> tuple[float, float]:
     """Return a tenth and ten times the task's price, or what a token saves at most without one."""
-    errors, tokens = np.array([(r.error_cost.mean(), r.tokens.mean()) for r in results.values()]).T
+    errors, tokens = np.array([(_mean(r.error_cost), _mean(r.tokens)) for r in results.values()]).T
     price = task.reward.price.middle or float(np.ptp(errors) / (tokens.max() or 1.0)) or 1.0
     return price / 10.0, price * 10.0
