@@ -98,13 +98,13 @@ films: $(STAMP)  ## the films of docs/films
 	.venv-$*/bin/uv pip install --quiet --system-certs --python .venv-$*/bin/python --no-deps --editable .
 	touch $@
 
-integrations: .venv-light/.installed  ## other libraries: SB3, rl-zoo3, TorchRL, SuperSuit, MO-Gymnasium
+integrations: .venv-light/.installed  ## other libraries: SB3, rl-zoo3, TorchRL, SuperSuit, MO-Gymnasium, Minari
 	.venv-light/bin/python -m pytest integrations/light
 
 integrations-tianshou: .venv-tianshou/.installed  ## Tianshou
 	.venv-tianshou/bin/python -m pytest integrations/tianshou
 
-integrations-rejax: .venv-rejax/.installed  ## rejax, Minari
+integrations-rejax: .venv-rejax/.installed  ## rejax
 	.venv-rejax/bin/python -m pytest integrations/rejax
 
 integrations-rllib: .venv-rllib/.installed  ## RLlib

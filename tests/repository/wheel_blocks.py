@@ -49,6 +49,7 @@ LISTED = (
     Listed("pip install ", "downloads: its extras are looked for in the wheel"),
     Listed("fusion-gym train --config tobit_oscillator_front", "minutes"),
     Listed("fusion-gym train ", "minutes", "--timesteps 1024"),
+    Listed("fusion-gym compare --config tobit_oscillator_front", "needs a training of minutes"),
     Listed("fusion-gym compare ", "minutes", "--episodes 4"),
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
