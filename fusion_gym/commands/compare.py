@@ -152,8 +152,9 @@ def cell(comparison: curves.Comparison | None) -> str:
     """Return a comparison as text."""
     if comparison is None:
         return "–"
-    share, low, high = comparison.relative
+    share, low, high = (100.0 * part for part in comparison.relative)
     if math.isnan(share):
         return f"{comparison.mean:.4g}"
-    change = f"{share:+.1%} ± {(high - low) / 2:.1%}" if share < 10.0 else "> +1000%"
-    return f"{comparison.mean:.4g}\n{change}"
+    digits = 0 if abs(share) > 10.0 else 1
+    change = f"{share:+.{digits}f} ± {(high - low) / 2:.{digits}f} %"
+    return f"{comparison.mean:.4g}\n{change if share < 1000.0 else '> +1000 %'}"
