@@ -46,7 +46,7 @@ from fusion_gym.policies.registry import make_policy, policy_names
 from fusion_gym.training.run import warn_of_unused_tokens
 from fusion_gym.validation import refusal
 
-Compared = Mapping[float, Mapping[str, curves.Comparison | None]]  # curves at rates or prices
+Compared = Mapping[float, Mapping[str, curves.PairedComparison | None]]  # curves at rates or prices
 _RATES = 0.1, 0.25, 0.5, 0.75  # shares of the highest rate
 
 
@@ -148,7 +148,7 @@ def _table(title: str, place: str, compared: Compared) -> Table:
     return tables.table_tables(title, heads, rows, caption)
 
 
-def cell(comparison: curves.Comparison | None) -> str:
+def cell(comparison: curves.PairedComparison | None) -> str:
     """Return a comparison as text."""
     if comparison is None:
         return "–"

@@ -61,7 +61,7 @@ def share_text(env_id: str, kind: str) -> str:
     It is the median of the seeds, with their range.
     """
     returns = returns_of(env_id)
-    if kind not in returns:
+    if not returns.keys() >= {kind, *NAIVE}:
         return "–"
     low = max(returns[name][0] for name in NAIVE)
     shares = [(own - low) / (returns["best threshold"][0] - low) for own in returns[kind]]

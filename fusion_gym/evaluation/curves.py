@@ -85,7 +85,7 @@ def _values(own: SearchRange, ends: Sequence[float], count: int) -> Array:
     return np.unique(own.value(np.linspace(first, last, count)))
 
 
-class Comparison(NamedTuple):
+class PairedComparison(NamedTuple):
     """A policy's mean, and its paired difference to the least mean of the other policies."""
 
     mean: float
@@ -102,14 +102,14 @@ class Comparison(NamedTuple):
         return {"mean": self.mean, "difference": self.difference._asdict()}
 
 
-def compare(samples: Mapping[str, Array | None]) -> dict[str, Comparison | None]:
+def compare(samples: Mapping[str, Array | None]) -> dict[str, PairedComparison | None]:
     """Return the comparison of policies by their samples, one per episode."""
     known: dict[str, Any] = {name: own for name, own in samples.items() if own is not None}
     order = sorted(known, key=lambda name: _mean(known[name]))
-    result: dict[str, Comparison | None] = dict.fromkeys(samples)
+    result: dict[str, PairedComparison | None] = dict.fromkeys(samples)
     for name, own in known.items():
         least = known[next((other for other in order if other != name), name)]
-        result[name] = Comparison(_mean(own), mean_interval(own - least))
+        result[name] = PairedComparison(_mean(own), mean_interval(own - least))
     return result
 
 
