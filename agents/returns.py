@@ -67,7 +67,7 @@ LEARNERS = {
         300_000,
     ),
     DEFAULTS: Learner(PPO, {"n_steps": 32}, 64, 300_000),
-    THRESHOLDS: Learner(SAC, {"gamma": 0.95}, 16, 10**8, {"action": "threshold"}),
+    THRESHOLDS: Learner(SAC, {"gamma": 0.95}, 16, 10**8, {"action": "threshold", "score": "value"}),
 }
 ON_THRESHOLDS = "fusion_gym/LinearFusion-v2", "fusion_gym/RemoteEstimation-v1"
 
