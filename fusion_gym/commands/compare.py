@@ -90,7 +90,7 @@ class Compare(EnvironmentOptions, Long):
         label = short_text if len({*map(short_text, names)}) == len(names) else str
         rules = {label(name): {text: results[text] for text in texts[name]} for name in names}
         low, high = span or curves.usual_prices(task, results)
-        most = max(float(item.rate.mean()) for item in results.values())
+        most = max(float(np.nanmean(item.rate)) for item in results.values())
         rates: Compared = {
             rate: curves.compare({n: curves.error_at_rate(c, rate) for n, c in rules.items()})
             for rate in (most * share for share in _RATES)

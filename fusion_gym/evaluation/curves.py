@@ -49,7 +49,7 @@ def sweep(task: Task, text: str, prices: Sequence[float], count: int = 24) -> li
     grid = _values(own, own[:2], _COARSE)
     trials = try_thresholds(task, template, grid.tolist(), _EPISODES, seeds.TUNING.start)
     share = np.array([trial.tokens for trial in trials])
-    share /= share.max() or 1.0
+    share /= np.nanmax(share) or 1.0
     places = np.flatnonzero((share > _LEFT) & (share < 1.0 - _LEFT))
     first, last = (places[0] - 1, places[-1] + 1) if len(places) else (0, len(grid) - 1)
     ends = grid[max(first, 0)], grid[min(last, len(grid) - 1)]
@@ -120,7 +120,7 @@ def _mean(samples: Array) -> float:
 
 def error_at_rate(curve: Curve, rate: float) -> Array | None:
     """Return the MSE (E,) of the curve's lower envelope at a rate, ``None`` to its left."""
-    least = min(float(item.rate.mean()) for item in curve.values())
+    least = min(_mean(item.rate) for item in curve.values())
     return envelope_error(curve, rate) if rate >= least else None
 
 

@@ -276,7 +276,7 @@ class EnvelopePoint(NamedTuple):
 
 
 def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
-    """Return the lower convex hull of the policies' points (rate, MSE).
+    """Return the lower convex hull of the policies' points (rate, MSE), without lost episodes.
 
     A random choice between two policies for each episode reaches every point of the line between
     them. No policy and no mixture of policies lies below the hull.
@@ -302,7 +302,7 @@ def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]
     if not results:
         raise ConfigurationError("policies = {} is not allowed: an envelope needs at least one")
     points = [
-        EnvelopePoint(name, float(result.rate.mean()), float(result.mse.mean()))
+        EnvelopePoint(name, float(np.nanmean(result.rate)), float(np.nanmean(result.mse)))
         for name, result in sorted(results.items())
     ]
     rates, errors = np.array([(point.rate, point.mse) for point in points]).T

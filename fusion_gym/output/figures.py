@@ -29,10 +29,12 @@ def pareto(path: Path, title: str, lines: Sequence[FigureLine], span: tuple[floa
     figure, (front, costs) = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
     rest = itertools.cycle((BLUE, SKY, GREEN, PURPLE, ORANGE, BLACK))
-    colours = [AGENT if line.label[:4] in ("mode", "zoo:") else next(rest) for line in lines]
+    colours = [AGENT if line.label.startswith(("model:", "zoo:")) else next(rest) for line in lines]
     prices = np.geomspace(*span, 40)
-    means = [[(r.error_cost.mean(), r.tokens.mean()) for r in line.results] for line in lines]
-    each = [(np.array(own) @ [np.ones(40), prices]).min(0) for own in means]
+    each = [
+        np.min([[r.cost(price).mean() for price in prices] for r in line.results], axis=0)
+        for line in lines
+    ]
     for line, own, colour in zip(lines, each, colours, strict=True):
         _draw(front, line, colour)
         costs.plot(prices, 100.0 * (own / np.min(each, axis=0) - 1.0), color=colour)
@@ -42,7 +44,7 @@ def pareto(path: Path, title: str, lines: Sequence[FigureLine], span: tuple[floa
     label = "cost = error + price · tokens,\nabove the least cost of all [%]"
     costs.set(xscale="log", ylim=(-2, 60), xlabel="price of a token", ylabel=label)
     costs.xaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
-    errors = np.array([result.mse.mean() for line in lines for result in line.results])
+    errors = np.array([np.nanmean(result.mse) for line in lines for result in line.results])
     if errors.max() > 6 * errors.min():
         front.set_yscale("log")
         front.yaxis.set(major_formatter=plain_tick, minor_formatter=plain_tick)
@@ -56,7 +58,7 @@ def plain_tick(value: float, place: float | None = None) -> str:
 
 
 def _draw(axes: plt.Axes, line: FigureLine, colour: str) -> None:
-    rate = np.array([result.rate.mean() for result in line.results])
+    rate = np.array([np.nanmean(result.rate) for result in line.results])
     order = np.argsort(rate, kind="stable")
     mean, low, high = np.array([mean_interval(line.results[i].mse) for i in order]).T
     axes.errorbar(

@@ -10,7 +10,7 @@ from command_runs import call, refusal
 
 from fusion_gym.commands.compare import cell, short_text
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.curves import compare
+from fusion_gym.evaluation.curves import compare, cost_at_price, error_at_rate
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
@@ -56,6 +56,19 @@ def test_a_difference_is_to_the_best_other_policy() -> None:
     low, high = compared["c"].difference[1:]
     assert (low, high) == (0.0, 2.0)
     assert "+100 ± " in cell(compared["b"])
+
+
+@pytest.mark.filterwarnings("ignore:1 of 2 episodes diverged")
+def test_a_lost_episode_leaves_errors_and_costs_infinitely_much() -> None:
+    task = make_task("fusion_gym/RemoteEstimation-v1", horizon=3)
+    results = run_episodes(task, make_policy("never", task), 2, 0)
+    whole = {"never": results}
+    for part in (results.mse, results.rate, results.error_cost, results.tokens):
+        part[0] = np.nan
+    error = error_at_rate(whole, 0.0)
+    assert error is not None
+    assert cell(compare({"never": error, "other": 2.0 * error})["other"]).endswith("+100 ± 0 %")
+    assert cost_at_price(whole, 1.0)[0] == np.inf  # so that another policy of the curve is taken
 
 
 def test_a_file_is_named_without_its_folder() -> None:
