@@ -16,6 +16,7 @@ import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -46,10 +47,20 @@ class RowStep:
         task: The task.
         memory: The memory; its states are not used.
         layout: The layout of the observation.
+        sizes: Sizes of further arrays of a row.
+        signals: Function from runs to these arrays, each (size, N).
     """
 
-    def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
+    def __init__(
+        self,
+        task: Task,
+        memory: Memory,
+        layout: ObservationLayout,
+        sizes: Sequence[int] = (),
+        signals: Callable[[Branch], Sequence[Any]] | None = None,
+    ) -> None:
         self.runs, plant, network = (task, memory, layout), task.plant, task.network
+        self.signals = sizes, signals
         self.start_noise = np.zeros((plant.start_channels + network.start_channels, 1))
         self.noise = np.zeros((plant.noise_channels + network.noise_channels, 1))
         number, steps = np.zeros(1), np.zeros(1, dtype=np.int64)
@@ -71,9 +82,15 @@ class RowStep:
         if state.control is not None:
             outcome += [number, state.control]
         self.results = [*outcome, *arrays_of(self._delivered)]
-        self.arrays = [*self.inputs, *self.results, observation]
-        *self._places, self._entries = _places(self.arrays)
-        first = len(self.inputs)
+        further = [np.zeros((size, 1)) for size in sizes]
+        self.arrays = [*self.inputs, *self.results, observation, *further]
+        places, first = _places(self.arrays), len(self.inputs)
+        count = first + len(self.results)
+        self._places, self._entries, self.further = (
+            places[:count],
+            places[count],
+            places[count + 1 :],
+        )
         own, self._after = self._places[first : first + len(outcome)], first + len(outcome)
         self._span = slice(own[0].start, own[-1].stop)
         self._fields = [  # whether a field of the outcome is a flag, and its place
@@ -82,7 +99,7 @@ class RowStep:
         ]
 
     def __reduce__(self) -> Any:
-        return type(self), self.runs
+        return type(self), (*self.runs, *self.signals)
 
     def __deepcopy__(self, memo: Any) -> RowStep:
         return self  # what it has compiled fits the copy
@@ -90,7 +107,7 @@ class RowStep:
     @property
     def width(self) -> int:
         """Number of entries of a row."""
-        return int(self._entries.stop)
+        return sum(array.size for array in self.arrays)
 
     def begin_memory(self, announcement: Any, control: Any, first: Any, measurement: Any) -> Memory:
         """Return the memory of one run after announcement, input and two measurements."""
@@ -114,7 +131,7 @@ class RowStep:
         """Return the arrays of a row at the start of :meth:`begin_run`."""
         branch = self.begin_run(*inputs)
         moved = branch.position(), branch.memory.states
-        return [*arrays_of(moved), *self.results, branch.observe()]
+        return [*arrays_of(moved), *self.results, *self._observed(branch)]
 
     def step_arrays(self, arrays: Sequence[Any], requests: Any, noise: Any) -> list[Any]:
         """Return the arrays of a row after a step, from a position's arrays, requests and noise."""
@@ -124,7 +141,11 @@ class RowStep:
         outcome = branch.step(requests, noise)
         moved = branch.position(), branch.memory.states
         after = arrays_of(outcome), arrays_of(branch.delivered)
-        return [*arrays_of(moved), *after[0], *after[1], branch.observe()]
+        return [*arrays_of(moved), *after[0], *after[1], *self._observed(branch)]
+
+    def _observed(self, branch: Branch) -> list[Any]:
+        signals = self.signals[1]
+        return [branch.observe(), *(signals(branch) if signals else ())]
 
     def pack(self, position: Position, memory: MemoryStates) -> Array:
         """Return the rows of a position and of the memory's states."""
@@ -234,6 +255,20 @@ class CompiledStep(RowStep):
         self._function("request" if flags else "assign")(len(after), *inputs, address)
         return after
 
+    def move(
+        self, rows: Array, requests: NDArray[np.bool_], noise: Array, after: Array, threads: int
+    ) -> None:
+        """Write the rows after a step into ``after``, by several threads."""
+        function, ends = self._function("request"), np.linspace(0, len(rows), threads + 1)
+
+        def part(first: int, end: int) -> None:
+            inputs = (np.ascontiguousarray(own[:, first:end]) for own in (requests, noise))
+            parts = rows[first:end], *inputs, after[first:end]
+            function(end - first, *map(_address, parts))
+
+        whole = ends.astype(np.int64).tolist()
+        list(_pool(threads).map(part, whole[:-1], whole[1:]))
+
     def _function(self, kind: str) -> Any:
         """Return the machine code of a start, or of a step with requests or assigned channels."""
         if kind not in self._functions:
@@ -247,12 +282,17 @@ class CompiledStep(RowStep):
                 sources = [Buffer(real, self.inputs, self.width), Buffer(real, [self.noise])]
                 sources.insert(1, Buffer(np.dtype(np.int8) if flags else whole, [requests]))
             self._functions[kind] = compile_function(
-                (self.runs[0], self.runs[1].owner, kind),
+                (self.runs[0], self.runs[1].owner, kind, self.signals),
                 self.start_arrays if kind == "start" else self.step_arrays,
                 sources,
                 [Buffer(real, self.arrays, self.width)],
             )
         return self._functions[kind]
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
 
 
 def _address(array: Any) -> int:

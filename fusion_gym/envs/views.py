@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from fusion_gym.arrays import Array
 from fusion_gym.core.action import Action, OwnBit
 from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.memory import Owner
@@ -20,6 +21,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.errors import ConfigurationError, refusal
 
 Rows = NDArray[np.float32]
+LARGEST_RATIO = 6.0  # of a rule's log ratios, as entries of an observation
 
 
 class SchedulerView:
@@ -112,6 +114,21 @@ View = SchedulerView | SensorView
 def make_view(task: Task, local: bool = False) -> View:
     """Return the scheduler's view of a task, or the sensors' view with ``local``."""
     return SensorView(task) if local else SchedulerView(task)
+
+
+def append_ratios(rows: Rows, ratios: Array) -> Rows:
+    """Return the rows (N·rows_per_run, entries) followed by a rule's log ratios (N, sensors)."""
+    column = np.clip(ratios, -LARGEST_RATIO, LARGEST_RATIO).reshape(len(rows), -1)
+    return np.concatenate((rows, column.astype(np.float32)), axis=1)
+
+
+def space_with_ratios(view: View, rule: bool) -> spaces.Box:
+    """Return the space of a view's rows, with a rule's log ratios behind them."""
+    if not rule:
+        return view.space
+    ends = np.full(view.action.sensors // view.rows_per_run, LARGEST_RATIO, np.float32)
+    low, high = np.append(view.space.low, -ends), np.append(view.space.high, ends)
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 def is_received(entry: ObservationEntry, broadcast: str | None) -> bool:

@@ -76,6 +76,9 @@ class DecisionGraph(torch.nn.Module):
             allowed = "True; the graph also returns the probability of every request"
             raise refusal("deterministic", False, allowed, "here")
         agent.refuse_frames()
+        if agent.rule is not None:
+            allowed = "none: an exported file does not compute the log ratios of a rule"
+            raise refusal("rule", type(agent.rule).__name__, allowed, "here")
         action = agent.view.action
         if not action.bits and isinstance(action.space, spaces.MultiDiscrete):
             allowed = "another kind, because the graph requests without channels"

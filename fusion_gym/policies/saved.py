@@ -59,7 +59,7 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Arguments, Plain
-from fusion_gym.envs.views import Rows, View, make_view
+from fusion_gym.envs.views import Rows, View, append_ratios, make_view, space_with_ratios
 from fusion_gym.errors import forbidden
 from fusion_gym.policies.base import Policy, Requests, Stateless
 from fusion_gym.policies.registry import make_policy
@@ -193,27 +193,32 @@ class ModelView:
         local: whether every sensor runs the model on its local view.
         price_range: range of the price of a token; None for a fixed price.
         nominal_error: scale of the entries of beliefs (n,); None for none.
+        rule: text of a priced_threshold, whose log ratios are the last entries; None for none.
     """
 
     observation_names: tuple[str, ...] | None = None
     local: bool = False
     price_range: tuple[float, float] | None = None
     nominal_error: tuple[float, ...] | None = None
+    rule: str | None = None
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> ModelView:
         """Return the view of an archive's card; without a card, the whole view of a scheduler."""
         card_entry = _entry(data)
         names, span = card_entry.get("observation_names"), card_entry.get("price_range")
-        error = card_entry.get("nominal_error")
+        error, rule = card_entry.get("nominal_error"), card_entry.get("rule")
         listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
         if names is not None and not listed:
             raise ConfigurationError("observation_names is not allowed: it must be a list of words")
+        if not isinstance(rule, str | None):
+            raise refusal("rule", rule, "a text")
         return cls(
             None if names is None else tuple(names),
             validation.boolean("local", card_entry.get("local", False)),
             None if span is None else Price.create("random", span).span,
             None if error is None else _errors(error),
+            rule,
         )
 
     def on(self, task: Task) -> Task:
@@ -251,8 +256,13 @@ def read_declaration(data: Mapping[str, Any]) -> tuple[str, Arguments, tuple[int
     raise NeedsTrust("its observation is not a vector")
 
 
-def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
-    """Write the card of the task, or of a sensor's local view of it, into a model before a save."""
+def tag_model(
+    model: BaseAlgorithm, task: Task, local: bool = False, rule: str | None = None
+) -> None:
+    """Write the card of the task, or of a sensor's local view of it, into a model before a save.
+
+    With a ``rule`` its log ratios follow the observation.
+    """
     entries = {
         "format": FORMAT,
         "algorithm": algorithm_name(model),
@@ -263,6 +273,8 @@ def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
     if task.nominal_error is not None:
         entries["nominal_error"] = task.nominal_error.tolist()
         entries["reward_scale"] = task.settings["reward_scale"]
+    if rule is not None:
+        entries["rule"] = rule
     setattr(model, ENTRY, entries)
 
 
@@ -372,13 +384,19 @@ class ModelPolicy:
         self._layout = None if same else ObservationLayout(self.task, owner)
         self._memory: Any = None  # of a recurrent policy
         self._stack: Any = None  # of an agent of several frames
-        self.frames = (model.observation_space.shape or (0,))[0] // self.view.space.shape[0]
+        self.rule_text = trained.rule
+        self.rule = None if trained.rule is None else calibration_rule(trained.rule, self.task)
+        size = space_with_ratios(self.view, self.rule is not None).shape[0]
+        self.frames = (model.observation_space.shape or (0,))[0] // size
         self.normalization: VecNormalize | None = None  # of the training
         self.offset = 0.0  # of the logarithms of thresholds
         stateful = isinstance(model, RecurrentPPO) or self.frames > 1
         self.stateless = deterministic and not stateful
         self.knowledge: Knowledge = self.view.knowledge
         self.memory_owner = self.view.owner
+        if self.rule is not None:
+            self.memory_owner = self.rule.memory_owner or self.memory_owner
+            self.knowledge = least_covering((self.knowledge, self.rule.knowledge))
         if isinstance(self.view.action, Threshold):  # the sensors' scores take part
             self.knowledge = least_covering((self.knowledge, self.view.action.score.knowledge))
         if stateful and self.knowledge != "centre":
@@ -395,6 +413,8 @@ class ModelPolicy:
                 raise forbidden("price", price, reason)
             price_setting = Price.create(price, span)
             self.price = float(price_setting.encode(price_setting.draw(np.zeros(1)))[0])
+            if self.rule is not None:
+                self.rule.price = price
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Clear the memory and the frames, and draw from the stream of ``seed``."""
@@ -441,7 +461,7 @@ class ModelPolicy:
         rows: Any = self.view.rows(observation)
         if self.normalization is not None:
             rows = self.normalization.normalize_obs(rows)
-        return rows
+        return rows if self.rule is None else append_ratios(rows, self.rule.log_ratio(signals).T)
 
     def refuse_frames(self) -> None:
         """Refuse an agent of several frames."""
@@ -598,8 +618,9 @@ def _rebuilt(
     algorithm, arguments, shape, actions = read_declaration(data)
     weights = read_weights(file)
     action, view = _fitted(task, observed, shape, actions)
-    frames = shape[0] // view.space.shape[0]
-    space: Any = StackedObservations(1, frames, view.space).stacked_observation_space
+    single = space_with_ratios(view, observed.rule is not None)
+    frames = shape[0] // single.shape[0]
+    space: Any = StackedObservations(1, frames, single).stacked_observation_space
     model = _model(algorithm, arguments, weights, space, view.action.space)
     if algorithm == "dqn":  # its random decisions need the exploration rate
         rate = data.get("exploration_rate", 0.0)
@@ -669,7 +690,7 @@ def _fitted(
             f"has {len(view.names)}; missing are {missing[:4] or 'none'}, unknown to the model "
             f"{extra[:4] or 'none'}" + ("" if missing or extra else " (the order differs)")
         )
-    size = view.space.shape[0]
+    size = space_with_ratios(view, observed.rule is not None).shape[0]
     if len(shape) != 1 or shape[0] % size or (names is not None and shape[0] > size):
         raise ConfigurationError(
             f"{trained} shape {shape}, the task (information={task.options.information!r}) has "

@@ -77,7 +77,8 @@ def calibrate(
         prices: prices of a token in increasing order.
         episodes: tuning episodes of all candidates, and of the last round.
         output: the file to write.
-        rule: text of a priced_threshold; by default the start of a search of the agents' class.
+        rule: text of a priced_threshold; by default the first agent's, or the start of a search of
+            the agents' class.
 
     Raises:
         ConfigurationError: an agent without one logit for each sensor, or a rule of another kind.
@@ -86,6 +87,7 @@ def calibrate(
     for agent in agents:
         agent.check_logits()
     (first, last), rows = episodes, []
+    rule = agents[0].rule_text if rule is None else rule
     if rule is None:
         name, count = class_of(task, agents[0].view.rows_per_run > 1), (first, max(1, last // 4))
         search = search_of_class(name, task, prices, episodes=count)

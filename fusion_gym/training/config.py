@@ -101,7 +101,7 @@ class NetworkConfig(Strict):
     """The agent's networks."""
 
     hidden: tuple[Positive, ...] = (64, 64)
-    activation: Literal["tanh", "relu"] = "tanh"
+    activation: Literal["tanh", "relu", "silu"] = "tanh"
 
 
 class AlgorithmConfig(Strict):
@@ -122,7 +122,8 @@ class AlgorithmConfig(Strict):
         value = self.model_dump(exclude=ours)
         if self.learning_rate_end is not None:
             value["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
-        activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.network.activation]
+        kinds = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}
+        activation = kinds[self.network.activation]
         shape = {"net_arch": list(self.network.hidden), "activation_fn": activation}
         return value | {"policy_kwargs": shape}
 
@@ -164,6 +165,39 @@ class CounterfactualConfig(PPOConfig):
     n_epochs: Positive = 8
     alternatives: Literal["all", "flips"] | None = None
     path_credit: bool = True
+
+
+class BranchingConfig(AlgorithmConfig):
+    """PPO with branches over a window (:mod:`.branching`), without discount.
+
+    Every set of requests of a decision runs on for ``window`` steps, which all count as time steps.
+    ``rule`` is the text of a ``priced_threshold``, at which the policy starts, by default the best
+    single threshold at each price. ``ent_coef`` falls to 0.
+    """
+
+    gamma: Annotated[float, pydantic.Field(ge=1, le=1)] = 1.0
+    learning_rate_end: Rate | None = 1e-5
+    network: NetworkConfig = NetworkConfig(hidden=(128, 128), activation="silu")
+    ent_coef: Weight = 0.01
+    max_grad_norm: Rate = 0.5
+    n_epochs: Positive = 4
+    clip_range: Annotated[float, pydantic.Field(gt=0, lt=1)] = 0.2
+    window: Positive = 10
+    rule: str | None = None
+
+    def arguments(self) -> Arguments:
+        """Return the arguments of the algorithm's class; the rule belongs to the environment."""
+        result = super().arguments()
+        result.pop("rule")
+        result["policy_kwargs"]["ortho_init"] = False
+        return result
+
+    @pydantic.field_validator("network")
+    @classmethod
+    def _of_pairs(cls, network: NetworkConfig) -> NetworkConfig:
+        if network.activation != "silu":
+            raise ValueError("activation must be silu, of which two units pass on a log ratio")
+        return network
 
 
 class RecurrentPPOConfig(PPOConfig):
@@ -225,19 +259,20 @@ class Algorithm:
         return self.place.startswith(_OWN)
 
 
-_OWN, _SB3, _MORE = "fusion_gym.training.counterfactual:", "stable_baselines3:", "sb3_contrib:"
+_OWN, _SB3, _MORE = "fusion_gym.training.", "stable_baselines3:", "sb3_contrib:"
 _CREDIT = "this library ([Learning](learning.md))"
 TABLE = {
     "a2c": Algorithm(
         f"{_SB3}A2C", A2CConfig, "advantage actor-critic",
         "V. Mnih et al., ICML 2016 (arXiv 1602.01783)", actions=tuple(ACTIONS),
     ),
-    "counterfactual_maskable_ppo": Algorithm(
-        f"{_OWN}CounterfactualMaskablePPO", CounterfactualConfig,
-        "PPO with counterfactual credit and the mask of `maskable_ppo`", _CREDIT,
+    "branching_ppo": Algorithm(
+        f"{_OWN}branching:BranchingPPO", BranchingConfig, "PPO with branches over a window",
+        _CREDIT, actions=("binary",),
     ),
     "counterfactual_ppo": Algorithm(
-        f"{_OWN}CounterfactualPPO", CounterfactualConfig, "PPO with counterfactual credit", _CREDIT
+        f"{_OWN}counterfactual:CounterfactualPPO", CounterfactualConfig,
+        "PPO with counterfactual credit", _CREDIT,
     ),
     "dqn": Algorithm(
         f"{_SB3}DQN", DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602",

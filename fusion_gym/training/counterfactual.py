@@ -13,11 +13,9 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
-from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -25,8 +23,6 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.action import Sets
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.validation import ConfigurationError, refusal
-
-_CLOSED = -1e8  # the logit of a masked choice
 
 
 class RolloutBatch(NamedTuple):
@@ -36,7 +32,6 @@ class RolloutBatch(NamedTuple):
 
     Args:
         observations: (B, entries), or with local decisions (B, sensors, entries).
-        masks: (B, choices), or with local decisions (B, sensors, choices); None without masks.
         choices: the choices (B, D).
         old: log-probabilities before the update (B, D, C).
         advantages: A (B, D, C).
@@ -46,7 +41,6 @@ class RolloutBatch(NamedTuple):
     """
 
     observations: torch.Tensor
-    masks: torch.Tensor | None
     choices: torch.Tensor
     old: torch.Tensor
     advantages: torch.Tensor
@@ -55,8 +49,8 @@ class RolloutBatch(NamedTuple):
     values: torch.Tensor
 
 
-class Counterfactual(OnPolicyAlgorithm):
-    """A mixin with counterfactual credit for PPO and MaskablePPO; it precedes them as a base class.
+class CounterfactualPPO(PPO):
+    """PPO with counterfactual credit, which saves models of PPO.
 
     The surrogate, its clipping and the λ-returns are from Schulman et al. 2015, 2017. For the
     action b taken and each alternative a of a decision, on the same noise,
@@ -83,7 +77,6 @@ class Counterfactual(OnPolicyAlgorithm):
         **kwargs: arguments of the algorithm.
     """
 
-    n_epochs: int
     batch_size: Any
     clip_range: Any
     _decisions: Decisions
@@ -110,7 +103,6 @@ class Counterfactual(OnPolicyAlgorithm):
         callback: BaseCallback,
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
-        use_masking: bool = True,
     ) -> bool:
         """Step all runs and the alternatives of their decisions; false if a callback ends it."""
         privileged, decisions = _privileged(env), self._decisions
@@ -121,9 +113,8 @@ class Counterfactual(OnPolicyAlgorithm):
         while len(steps) < n_rollout_steps:
             assert self._last_obs is not None
             observation = decisions.by_run(torch.as_tensor(self._last_obs))
-            masks = self._masks(privileged)
             with torch.no_grad():
-                old = decisions.log_probabilities(self._logits(observation, masks))
+                old = decisions.log_probabilities(self._logits(observation))
                 noise = -torch.log(-torch.log(torch.rand(old.shape)))
             choice = (old + noise).argmax(-1).numpy()
             (after, rewards, dones, infos), branched = privileged.step_alternatives(
@@ -143,7 +134,7 @@ class Counterfactual(OnPolicyAlgorithm):
             value = goes_on * self._value(decisions.by_run(follows))
             taken = rewards[first] + self.gamma * value
             values = decisions.arranged(choice, taken, branched.reward + self.gamma * beyond)
-            steps.append(_Step(observation, masks, choice, old, values, value, dones[first]))
+            steps.append(_Step(observation, choice, old, values, value, dones[first]))
             self._last_obs = after  # type: ignore[assignment]
             self._last_episode_starts = dones
         self._rollout = self._credited(steps)
@@ -164,10 +155,8 @@ class Counterfactual(OnPolicyAlgorithm):
         def joined(parts: Any) -> torch.Tensor:
             return torch.as_tensor(np.concatenate(parts), dtype=torch.float32)
 
-        masks = [step.masks for step in steps if step.masks is not None]
         return RolloutBatch(
             torch.cat([step.observation for step in steps]),
-            torch.cat(masks) if masks else None,
             torch.as_tensor(np.concatenate([step.choices for step in steps])),
             torch.cat([step.old for step in steps]),
             joined([s.values - mean[..., None] for s, mean in zip(steps, means, strict=True)]),
@@ -233,8 +222,7 @@ class Counterfactual(OnPolicyAlgorithm):
         self, rollout: RolloutBatch, batch: torch.Tensor, spread: float, clip: float
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         observation = rollout.observations[batch]
-        masks = None if rollout.masks is None else rollout.masks[batch]
-        new = self._decisions.log_probabilities(self._logits(observation, masks))
+        new = self._decisions.log_probabilities(self._logits(observation))
         old = rollout.old[batch]
         weight, change = old.exp(), new - old
         ratio = change.exp()
@@ -262,7 +250,7 @@ class Counterfactual(OnPolicyAlgorithm):
             }
         return loss, parts
 
-    def _logits(self, observation: torch.Tensor, masks: torch.Tensor | None) -> torch.Tensor:
+    def _logits(self, observation: torch.Tensor) -> torch.Tensor:
         """Return the logits of ``Discrete`` choices or of requests."""
         policy: Any = self.policy
         rows = policy.pi_features_extractor(observation.reshape(-1, observation.shape[-1]))
@@ -271,8 +259,7 @@ class Counterfactual(OnPolicyAlgorithm):
         if self._decisions.binary and logits.shape[-1] > self._decisions.sensors:
             pairs = logits.reshape(len(logits), -1, 2)  # silence and a request
             logits = pairs[..., 1] - pairs[..., 0]
-            masks = None if masks is None else masks.reshape(pairs.shape)[..., 1]
-        return logits if masks is None else logits.masked_fill(~masks, _CLOSED)
+        return logits
 
     def _critic(self, observation: torch.Tensor) -> torch.Tensor:
         policy: Any = self.policy
@@ -294,21 +281,6 @@ class Counterfactual(OnPolicyAlgorithm):
         rows = map(self._decisions.view.rows, observation)
         return np.stack([self._value(self._decisions.by_run(item)) for item in rows])
 
-    def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
-        """Return the masks of the runs' decisions, for an algorithm with masks."""
-        return None
-
-
-class CounterfactualPPO(Counterfactual, PPO):
-    """PPO with counterfactual credit, which saves models of PPO."""
-
-
-class CounterfactualMaskablePPO(Counterfactual, MaskablePPO):
-    """MaskablePPO with counterfactual credit, which saves models of MaskablePPO."""
-
-    def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
-        return self._decisions.by_run(torch.as_tensor(env.action_masks()))
-
 
 class _Step(NamedTuple):
     """One step of all runs, before it becomes part of a :class:`RolloutBatch`.
@@ -318,7 +290,6 @@ class _Step(NamedTuple):
     """
 
     observation: torch.Tensor
-    masks: torch.Tensor | None
     choices: Choices
     old: torch.Tensor
     values: Array

@@ -49,9 +49,23 @@ from fusion_gym.evaluation.rule_search import class_of, search_of_class
 from fusion_gym.importing import trust_files
 from fusion_gym.output import files
 from fusion_gym.output.progress import Bar, progress_bar, quietly, remark, writing
-from fusion_gym.policies.saved import DAMAGE, ModelPolicy, ModelView, load_model_policy, tag_model
+from fusion_gym.policies.saved import (
+    DAMAGE,
+    ENTRY,
+    ModelPolicy,
+    ModelView,
+    load_model_policy,
+    tag_model,
+)
 from fusion_gym.training.calibration import calibrate
-from fusion_gym.training.config import TABLE, EnvironmentConfig, Experiment, load_checked
+from fusion_gym.training.config import (
+    TABLE,
+    BranchingConfig,
+    EnvironmentConfig,
+    Experiment,
+    TrainingConfig,
+    load_checked,
+)
 from fusion_gym.validation import ConfigurationError, refusal
 
 DAMAGED = (*DAMAGE, KeyError, TypeError, ValueError)  # errors from a damaged checkpoint
@@ -216,12 +230,21 @@ def run_at_prices(
     each, numbers = np.repeat(prices, count), seed + np.tile(np.arange(count), len(prices))
     columns: list[Array] = [np.array(prices)]
     for deterministic in (True, False):
-        policy = ModelPolicy(model, task, deterministic, trained=ModelView(local=local))
+        trained = ModelView(local=local, rule=getattr(model, ENTRY).get("rule"))
+        policy = ModelPolicy(model, task, deterministic, trained=trained)
         means = run_priced(task, policy, numbers, each)
         columns += [means.cost(each), means.tokens, means.mse]
         columns += [means.rate.mean(-1)] if deterministic else []
     rows = np.transpose([column.reshape(len(prices), -1).mean(1) for column in columns])
     return [PriceRecord(*row) for row in rows.tolist()]
+
+
+def prices_of(task: Task) -> tuple[float, ...]:
+    """Return prices over the range of a drawn price, or the task's own price."""
+    price = task.reward.price
+    if price.fixed is not None or price.span is None:
+        return (price.middle,)
+    return tuple(np.geomspace(*price.span, PRICES).tolist())
 
 
 def threshold_costs(task: Task, local: bool, prices: Sequence[float]) -> Array:
@@ -419,11 +442,8 @@ class Progress(Callback):
 
     @functools.cached_property
     def prices(self) -> tuple[float, ...]:
-        """The prices of a token in validations: of a drawn price the range, else the task's own."""
-        price = self.task.reward.price
-        if price.fixed is not None or price.span is None:
-            return (price.middle,)
-        return tuple(np.geomspace(*price.span, PRICES).tolist())
+        """The prices of a token in validations."""
+        return prices_of(self.task)
 
     @functools.cached_property
     def references(self) -> Array:
@@ -459,6 +479,8 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
         "local": local,
         "price_exponent": training.price_exponent,
     }
+    if isinstance(experiment.algorithm, BranchingConfig):
+        return _rule_env(experiment.algorithm.rule, training, task, runs)
     reference = None
     if training.error != "squared":
         reference = _reference(task, where, training.error_filter)
@@ -467,6 +489,23 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     if reference is None and not TABLE[name].privileged:
         return FusionSB3VecEnv(task, **runs)
     return PrivilegedVecEnv(task, error=training.error, reference=reference, **runs)
+
+
+def _rule_env(
+    rule: str | None, training: TrainingConfig, task: Task, runs: Arguments
+) -> FusionSB3VecEnv:
+    """Return the environment of branches, with the rule at which they start."""
+    from fusion_gym.training.branching import RuleVecEnv
+
+    if training.error != "squared" or training.error_filter is not None:
+        raise refusal("error", training.error, "'squared'", "with algorithm 'branching_ppo'")
+    if training.price_exponent:
+        raise refusal("price_exponent", training.price_exponent, "0", "with 'branching_ppo'")
+    prices = prices_of(task)
+    if rule is None:
+        search = search_of_class(class_of(task, runs["local"]), task, prices, episodes=(16, 100))
+        rule = search.policy(search.first_point())
+    return RuleVecEnv(task, rule=rule, prices=prices, **runs)
 
 
 def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -> Estimator[Any]:
@@ -496,7 +535,7 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
     rate = getattr(settings, "initial_rate", None)
     if rate is not None:
         _begin_at(model, env, rate)
-    tag_model(model, env.task, local=experiment.environment.local)
+    tag_model(model, env.task, experiment.environment.local, getattr(env, "text", None))
     return model
 
 

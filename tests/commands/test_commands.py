@@ -178,7 +178,7 @@ def test_configs_go_by_path_or_by_shipped_name(
 def test_every_algorithm_can_be_loaded_by_its_name() -> None:
     for name, row in TABLE.items():
         # What is privileged in training saves models of the algorithm that it changes.
-        kind = ALGORITHMS[name.removeprefix("counterfactual_")]
+        kind = ALGORITHMS[re.sub("^(counterfactual|branching)_", "", name)]
         assert issubclass(row.model, kind)
         assert row.privileged == (row.model is not kind)
         plain = {

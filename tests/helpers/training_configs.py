@@ -16,7 +16,6 @@ SMALL: dict[str, dict[str, Any]] = {
     for kind, row in TABLE.items()
 }
 SMALL["a2c"]["n_steps"] = 8
-SMALL["counterfactual_maskable_ppo"]["alternatives"] = "flips"
 SMALL["dqn"] |= {"batch_size": 32, "learning_rate_end": 1e-4}
 
 

@@ -22,11 +22,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.onnx_export import DecisionGraph
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.saved import ModelPolicy, load_model_policy, tag_model
-from fusion_gym.training.counterfactual import (
-    CounterfactualMaskablePPO,
-    CounterfactualPPO,
-    Decisions,
-)
+from fusion_gym.training.counterfactual import CounterfactualPPO, Decisions
 from fusion_gym.validation import ConfigurationError
 
 NAME, RUNS = "fusion_gym/CorrelatedTracking-v1", 5
@@ -34,7 +30,7 @@ PAIRS: dict[str, Any] = {"access": "assignment", "channels": 2, "tokens": "unlim
 LOSSY = PAIRS | {"channel": "independent", "drop_probability": QUALITY}
 FADING = PAIRS | {"channel": "gilbert_elliott"}
 ASSIGNED = LOSSY | {"action": "assignment", "horizon": 20}
-LEARNERS = [PPO, MaskablePPO, CounterfactualPPO, CounterfactualMaskablePPO]
+LEARNERS = [PPO, MaskablePPO, CounterfactualPPO]
 
 
 def task_of(**options: Any) -> Any:

@@ -126,7 +126,7 @@ def test_returns_and_advantages_are_those_of_the_definition() -> None:
         old = torch.as_tensor(np.log(np.stack((1 - probability, probability), -1)))
         steps.append(
             _Step(
-                torch.zeros((RUNS, env.observation_space.shape[0])), None,  # type: ignore[index]
+                torch.zeros((RUNS, env.observation_space.shape[0])),  # type: ignore[index]
                 rng.integers(0, 2, (RUNS, 3)), old, rng.normal(size=(RUNS, 3, 2)),
                 rng.normal(size=RUNS), rng.random(RUNS) < 0.3,
             )
@@ -154,10 +154,10 @@ def test_returns_and_advantages_are_those_of_the_definition() -> None:
 SETTINGS: list[Any] = [
     ("counterfactual_ppo", {"memory": True}, {"error": "mismatch"}, {}),
     (
-        "counterfactual_maskable_ppo",
+        "counterfactual_ppo",
         {"cost_weight": "random", "price_range": [0.003, 0.3]}, {"price_exponent": 0.5}, {},
     ),
-    ("counterfactual_maskable_ppo", {}, {}, {"local": True}),
+    ("counterfactual_ppo", {}, {}, {"local": True}),
 ]  # fmt: skip
 
 

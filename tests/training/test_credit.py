@@ -8,11 +8,7 @@ import torch
 
 import fusion_gym
 from fusion_gym.envs.privileged import PrivilegedVecEnv
-from fusion_gym.training.counterfactual import (
-    CounterfactualMaskablePPO,
-    CounterfactualPPO,
-    RolloutBatch,
-)
+from fusion_gym.training.counterfactual import CounterfactualPPO, RolloutBatch
 
 ENV = "fusion_gym/TobitOscillator-v1"
 
@@ -39,13 +35,13 @@ def test_the_surrogate_is_clipped_from_below(kind: Any, path_credit: bool) -> No
     rows = (6, 3) if kind == "local" else (6,)
     observations = torch.randn((*rows, *env.observation_space.shape), generator=generator)  # type: ignore[misc]
     decisions = model._decisions
-    new = decisions.log_probabilities(model._logits(observations, None)).detach()
+    new = decisions.log_probabilities(model._logits(observations)).detach()
     old = (new + torch.randn(new.shape, generator=generator)).log_softmax(-1)
     advantages = torch.randn(new.shape, generator=generator)
     surplus = torch.randn(6, generator=generator)
     choice = torch.randint(0, decisions.choices, new.shape[:2], generator=generator)
     rollout = RolloutBatch(
-        observations, None, choice, old, advantages, surplus, torch.zeros(6), torch.zeros(6)
+        observations, choice, old, advantages, surplus, torch.zeros(6), torch.zeros(6)
     )
     loss, _ = model._loss(rollout, torch.arange(6), 1.0, 0.2)
 
@@ -59,38 +55,15 @@ def test_the_surrogate_is_clipped_from_below(kind: Any, path_credit: bool) -> No
     np.testing.assert_allclose(float(loss.detach()), -(gain + path_credit * late).mean(), rtol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["all", "flips"])
-def test_masked_requests_have_no_probability(kind: Any) -> None:
-    """Those of single sensors; the other sensors decide as without masks."""
-    model = CounterfactualMaskablePPO("MlpPolicy", env_of(), alternatives=kind, batch_size=30)
-    observations = torch.rand((6, *model.observation_space.shape))  # type: ignore[misc]
-    masks = torch.ones((6, 6), dtype=torch.bool)
-    masks[::2, 3] = False  # the request of the second of three sensors
-
-    def requests(masks: torch.Tensor) -> torch.Tensor:
-        values = model._decisions.log_probabilities(model._logits(observations, masks)).exp()
-        sets = torch.as_tensor(model._decisions.action.table, dtype=torch.float32)
-        return values @ sets if kind == "all" else values[..., 1][:, None]
-
-    apart, usual = requests(masks)[:, 0].detach(), requests(torch.ones_like(masks))[:, 0].detach()
-    assert (apart[::2, 1] < 1e-6).all()
-    assert (usual > 0.1).all()
-    apart[::2, 1] = usual[::2, 1]
-    torch.testing.assert_close(apart, usual)
-
-
 @pytest.mark.parametrize("action", ["binary", "multidiscrete", "discrete"])
-@pytest.mark.parametrize("learner", [CounterfactualPPO, CounterfactualMaskablePPO])
-def test_the_credited_chances_are_the_policys(learner: Any, action: str) -> None:
+def test_the_credited_chances_are_the_policys(action: str) -> None:
     env = env_of(action=action)
     env.reset()
-    model = learner("MlpPolicy", env, batch_size=30, seed=0)
+    model: Any = CounterfactualPPO("MlpPolicy", env, batch_size=30, seed=0)
     with torch.no_grad():
         model.policy.action_net.weight.mul_(100.0)
     observations = torch.rand((5, *model.observation_space.shape))
-    masks: Any = torch.ones(env.action_masks().shape, dtype=torch.bool)
-    masks = masks if learner is CounterfactualMaskablePPO else None
-    values = model._decisions.log_probabilities(model._logits(observations, masks))
+    values = model._decisions.log_probabilities(model._logits(observations))
     choice = torch.randint(0, model._decisions.choices, values.shape[:2])
     actions = torch.as_tensor(model._decisions.actions(choice.numpy())).float()
     expected = model.policy.evaluate_actions(observations, actions)[1]

@@ -17,8 +17,7 @@ from fusion_gym.training.run import check_run
 
 Content = dict[str, Any]
 _UNKNOWN = ("nobody_knows_this",)
-SMALL = {"network": {"hidden": [4], "activation": "tanh"}, "batch_size": 8}
-SMALL |= {"buffer_size": 100, "n_steps": 8}
+SMALL = {"batch_size": 8, "buffer_size": 100, "n_steps": 8}
 
 
 def plain(kind: str) -> Content:
@@ -30,6 +29,7 @@ def plain(kind: str) -> Content:
     content["training"]["num_envs"] = 2
     content["algorithm"] = TABLE[kind].config(name=kind).model_dump(mode="json")
     content["algorithm"] |= {key: SMALL[key] for key in SMALL.keys() & content["algorithm"].keys()}
+    content["algorithm"]["network"]["hidden"] = [4]
     return content
 
 

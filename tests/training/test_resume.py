@@ -68,7 +68,7 @@ CASES = [
             ("maskable_ppo", "drawn", {}),
             ("recurrent_ppo", "fixed", {}),
             ("counterfactual_ppo", "fixed", {"error": "mismatch"}),
-            ("counterfactual_maskable_ppo", "drawn", {"error": "excess"}),
+            ("counterfactual_ppo", "drawn", {"error": "excess"}),
         )
     ),
 ]
