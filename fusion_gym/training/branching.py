@@ -48,6 +48,7 @@ MOST_SETS = 64
 _ALL = 3  # sensors of which any requests change; of more, at most two
 _SLOPE = 3.0  # of the first logits on the rule's log ratios
 _ALONE = 0.04  # share of the training in which only the critic learns
+_SHORTEST = 10  # steps of a branch
 _OFTEN = 0.6  # share of the episodes that have one of the validation's prices
 _PRICES, _EPISODES = 9, 64  # of the rule's costs
 _VALUE = 10.0  # steps of the rule's cost that one unit of the critic is
@@ -140,17 +141,18 @@ class Branches:
 
     Args:
         env: the training's environment.
-        window: steps of a branch.
+        window: steps of a branch, in mean times between two packets of the rule.
         seed: seed of the noise.
 
     Attributes:
+        timesteps: steps of all branches so far.
         changes: (A, sensors) bool, which requests of the likeliest action each set changes.
 
     Raises:
         ConfigurationError: too many sensors, or a task that machine code does not run.
     """
 
-    def __init__(self, env: RuleVecEnv, window: int, seed: int | None) -> None:
+    def __init__(self, env: RuleVecEnv, window: float, seed: int | None) -> None:
         from fusion_gym.core.compiled import CompiledStep
 
         task, sensors = env.task, env.task.sensors
@@ -160,24 +162,27 @@ class Branches:
             raise refusal("sensors", sensors, "at most 10, whose sets of requests branch", "here")
         every = (np.arange(2**sensors)[:, None] >> np.arange(sensors) & 1).astype(np.bool_)
         self.changes = every[every.sum(1) <= most]
-        parts = Memory(task, env.owner), ObservationLayout(task, env.owner)
+        memory, layout = Memory(task, env.owner), ObservationLayout(task, env.owner)
         try:
             task.refuse_numpy_only()
             sizes = sensors, len(task.plant.state_names)
-            self.step = CompiledStep(task, *parts, sizes, RuleSignals(env.rule))
+            self.step = CompiledStep(task, memory, layout, sizes, RuleSignals(env.rule))
         except LoweringError as error:
             reason = f"machine code does not run it ({error}); use counterfactual_ppo"
             raise ConfigurationError(f"algorithm = 'branching' is not allowed: {reason}") from None
         self._prices = np.geomspace(min(env.prices), max(env.prices), _PRICES)
         each = np.repeat(self._prices, _EPISODES)
         numbers = seeds.TUNING.start + np.tile(np.arange(_EPISODES), _PRICES)
-        costs = run_priced(task, env.rule, numbers, each).cost(each)
-        self._costs = np.maximum(costs.reshape(_PRICES, -1).mean(1), 1e-12)
+        means = run_priced(task, env.rule, numbers, each)
+        parts = means.cost(each), means.rate.sum(-1)
+        cost, packets = (part.reshape(_PRICES, -1).mean(1) for part in parts)
+        self._costs, self._packets = np.maximum(cost, 1e-12), packets
         weights = np.asarray(task.reward.state_weights)
         self._weights = np.sqrt(weights if weights.ndim == 1 else weights.diagonal())
         runs = np.arange(env.runs)
         self.rows = np.empty((env.runs, self.step.width))
-        self._lanes = np.empty((2, env.runs * len(self.changes), self.step.width))
+        self._rooms = np.empty((2, env.runs * len(self.changes), self.step.width))
+        self.timesteps = 0
         self.price, self.left = np.ones(env.runs), np.zeros(env.runs, dtype=np.int64)
         self._begin(runs, self.random.integers(1, task.horizon + 1, env.runs))
 
@@ -205,6 +210,13 @@ class Branches:
     def unit(self, price: Array) -> Array:
         """Return the rule's cost per step at prices."""
         return np.exp(np.interp(np.log(price), np.log(self._prices), np.log(self._costs)))
+
+    def windows(self, price: Array) -> NDArray[np.int64]:
+        """Return the steps of branches at prices."""
+        horizon = self.env.task.horizon
+        packets = np.interp(np.log(price), np.log(self._prices), self._packets)
+        steps = np.ceil(self.window / np.maximum(packets, self.window / horizon))
+        return np.clip(steps, min(_SHORTEST, horizon), horizon).astype(np.int64)
 
     def observations(self, rows: Array) -> torch.Tensor:
         """Return the policy's observations of rows."""
@@ -246,36 +258,45 @@ class Branches:
         sets = torch.as_tensor(own, dtype=torch.float32)
         old = log_probabilities(logits, sets)
         noise = self.random.gumbel(size=old.shape)
-        taken = np.arange(count) * width + (old.numpy() + noise).argmax(1)
-        moment = self.random.integers(1, self.window + 1, count)  # at which a run goes on
-        (lanes, after), price = self._lanes, self.price.repeat(width)
-        np.take(self.rows, np.repeat(np.arange(count), width), axis=0, out=lanes, mode="clip")
-        unit, cost = self.unit(self.price), np.zeros(count * width)
-        goes_on, moved, over = np.ones(count * width, np.bool_), self.rows.copy(), moment < 0
-        steps = moment.copy()
-        requests = own.reshape(count * width, -1)
-        for step in range(1, self.window + 1):
+        taken = (old.numpy() + noise).argmax(1)
+        window, unit = self.windows(self.price), self.unit(self.price)
+        moment = np.ceil(self.random.random(count) * window)  # at which a run goes on
+        cost, steps, over = np.zeros((count, width)), np.zeros(count, np.int64), moment < 0
+        run, branch = np.indices((count, width)).reshape(2, -1)  # of each lane
+        first, second = self._rooms  # memory that is used again
+        lanes = np.take(self.rows, run, axis=0, out=first, mode="clip")
+        requests, moved = own[run, branch], self.rows.copy()
+        for step in range(1, window.max() + 1):
             if step > 1:
                 requests = self.requests(logits_of(self.observations(lanes)))
-            noise = self._normals(len(self.step.noise), count).repeat(width, axis=1)
+            noise, after = self._normals(len(self.step.noise), count), second[: len(run)]
             began = time.perf_counter()
-            self.step.move(lanes, requests.T, noise, after, torch.get_num_threads())
+            self.step.move(lanes, requests.T, noise[:, run], after, torch.get_num_threads())
             self.env.seconds += time.perf_counter() - began
-            lanes, after = after, lanes
-            outcome = self.step.outcome(lanes)
-            cost += np.where(goes_on, price * outcome.cost - outcome.reward_error, 0.0)
-            goes_on &= ~outcome.ended
-            leaves = (moment >= step) & ((moment == step) | ~goes_on[taken])
-            moved[leaves], over[leaves] = lanes[taken[leaves]], ~goes_on[taken[leaves]]
-            steps[leaves], moment[leaves] = step, 0
-        left = np.maximum(self.left - self.window, 0)
-        end = value_of(self.privileged(lanes, price, left.repeat(width))).numpy()
-        cost /= unit.repeat(width)
-        cost += goes_on * (_VALUE * end + left.repeat(width))
-        costs = np.nan_to_num(cost.reshape(count, width), nan=1e6, posinf=1e6)
+            self.timesteps += len(run)
+            outcome = self.step.outcome(after)
+            charge = self.price[run] * outcome.cost - outcome.reward_error
+            cost[run, branch] += charge / unit[run]
+            leaves = (branch == taken[run]) & (steps[run] == 0)
+            leaves &= outcome.ended | (moment[run] == step)
+            place = run[leaves]
+            moved[place], over[place], steps[place] = after[leaves], outcome.ended[leaves], step
+            last = ~outcome.ended & (window[run] == step)
+            left = self.left[run[last]] - step
+            end = value_of(self.privileged(after[last], self.price[run[last]], left)).numpy()
+            cost[run[last], branch[last]] += _VALUE * end + left
+            (stays,) = np.nonzero(~outcome.ended & ~last)
+            if not stays.size:
+                break
+            first, second, lanes = second, first, after
+            if stays.size < run.size:
+                run, branch = run[stays], branch[stays]
+                first, second = second, first
+                lanes = np.take(after, stays, axis=0, out=first[: stays.size], mode="clip")
+        costs = np.nan_to_num(cost, nan=1e6, posinf=1e6)
         mean = (np.exp(old.numpy()) * costs).sum(1, keepdims=True)
-        self.rows, values = moved, (mean[:, 0] - self.left) / _VALUE
-        self.left = self.left - steps
+        values = (mean[:, 0] - self.left) / _VALUE
+        self.rows, self.left = moved, self.left - steps
         self._begin(np.flatnonzero(over), self.env.task.horizon)
         real = (torch.as_tensor(part, dtype=torch.float32) for part in (mean - costs, values))
         return BranchedDecisions(observations, privileged, sets, old, *real)
@@ -290,20 +311,20 @@ class BranchingPPO(PPO):
     """PPO whose advantages come from branches over a window.
 
     Each update has one decision of every run. The surrogate and its clipping are from Schulman et
-    al. 2017, as a sum over all sets. The weight of the entropy falls to zero, so that the likeliest
-    action becomes the policy.
+    al. 2017, as a sum over all sets. The entropy keeps every set in the sum, whereas branches and
+    use follow the likeliest action.
 
     Args:
         policy: class of the policy.
         env: a RuleVecEnv.
-        window: steps of a branch.
+        window: steps of a branch, in mean times between two packets of the rule.
         **kwargs: arguments of PPO.
     """
 
     policy: Any
     clip_range: Any
 
-    def __init__(self, policy: Any, env: Any, *, window: int = 10, **kwargs: Any) -> None:
+    def __init__(self, policy: Any, env: Any, *, window: float = 1.0, **kwargs: Any) -> None:
         self.window = window
         size = 2 if env is None else max(2, env.num_envs)
         super().__init__(policy, env, n_steps=1, batch_size=size, **kwargs)
@@ -344,9 +365,10 @@ class BranchingPPO(PPO):
         """Branch a decision of every run; false if a callback ends it."""
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
+        before = self._branches.timesteps
         with torch.no_grad():
             self._decisions = self._branches.decide(self._logits, self._value)
-        self.num_timesteps += self._decisions.old.numel() * self.window
+        self.num_timesteps += self._branches.timesteps - before
         goes_on = callback.on_step()
         callback.on_rollout_end()
         return goes_on
@@ -371,7 +393,7 @@ class BranchingPPO(PPO):
             value = nn.functional.smooth_l1_loss(self._value(privileged), values)
             for optimizer in optimizers:
                 optimizer.zero_grad()
-            (policy - self.ent_coef * left * entropy + value).backward()
+            (policy - self.ent_coef * entropy + value).backward()
             for parameter, mask in self._masks:
                 assert parameter.grad is not None
                 parameter.grad *= mask

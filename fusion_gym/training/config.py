@@ -170,19 +170,20 @@ class CounterfactualConfig(PPOConfig):
 class BranchingConfig(AlgorithmConfig):
     """PPO with branches over a window (:mod:`.branching`), without discount.
 
-    Every set of requests of a decision runs on for ``window`` steps, which all count as time steps.
+    Every set of requests of a decision runs on for a while, ``window`` mean times between two
+    packets of the rule, at least 10 steps. All these steps count as time steps.
     ``rule`` is the text of a ``priced_threshold``, at which the policy starts, by default the best
-    single threshold at each price. ``ent_coef`` falls to 0.
+    single threshold at each price.
     """
 
     gamma: Annotated[float, pydantic.Field(ge=1, le=1)] = 1.0
     learning_rate_end: Rate | None = 1e-5
     network: NetworkConfig = NetworkConfig(hidden=(128, 128), activation="silu")
-    ent_coef: Weight = 0.01
+    ent_coef: Weight = 0.03
     max_grad_norm: Rate = 0.5
     n_epochs: Positive = 4
     clip_range: Annotated[float, pydantic.Field(gt=0, lt=1)] = 0.2
-    window: Positive = 10
+    window: Rate = 1.0
     rule: str | None = None
 
     def arguments(self) -> Arguments:

@@ -48,7 +48,7 @@ def config(folder: Path, case: str = "scheduler", **more: Any) -> fusion_gym.Exp
         "environment": {
             "id": "fusion_gym/TobitOscillator-v1", "options": options | PRICED, "local": local,
         },
-        "algorithm": {"name": "branching_ppo", "rule": rule, "window": 4},
+        "algorithm": {"name": "branching_ppo", "rule": rule},
         "training": {"timesteps": 2000, "num_envs": 8},
         "validation": {"every": 500, "episodes": 10},
         "calibration": None,
@@ -65,12 +65,16 @@ def test_the_cost_of_a_set_is_that_of_a_simulation(
 ) -> None:
     """NumPy runs each set and then silence, on the same noise, up to the critic or the end."""
     env = env_of(case)
-    branches, drawn = Branches(env, 4, 0), []
+    monkeypatch.setattr(Branches, "windows", lambda _, price: np.where(price < 0.1, 3, 5))
+    branches, drawn = Branches(env, 2.0, 0), []
     normals = branches._normals
     monkeypatch.setattr(branches, "_normals", lambda *a: drawn.append(normals(*a)) or drawn[-1])
     position, states = copy.deepcopy(branches.step.moved(branches.rows))
     price, left = branches.price.copy(), branches.left.copy()
-    assert left.min() < 4 < left.max()
+    window = branches.windows(price)
+    assert (left < window).any()
+    assert (left > window).any()
+    assert {*window} == {3, 5}
     decisions = branches.decide(
         lambda rows: torch.full((len(rows), 3), -60.0), lambda rows: torch.full((len(rows),), 0.3)
     )
@@ -79,12 +83,12 @@ def test_the_cost_of_a_set_is_that_of_a_simulation(
         memory = Memory(env.task, env.owner).with_states(states)
         runs = Branch(env.task, memory, ObservationLayout(env.task, env.owner), position)
         cost, goes_on = np.zeros(6), np.ones(6, np.bool_)
-        for step in range(4):
+        for step in range(5):
             sent = np.repeat(requests[:, None], 6, axis=1) & (step == 0)
             outcome = runs.step(sent, drawn[step])
-            cost += goes_on * (price * outcome.cost - outcome.reward_error)
+            cost += (goes_on & (step < window)) * (price * outcome.cost - outcome.reward_error)
             goes_on = goes_on & (step + 1 < left)
-        later = np.where(goes_on, 10.0 * 0.3 + left - 4, 0.0)
+        later = np.where(left > window, 10.0 * 0.3 + left - window, 0.0)
         costs.append(cost / branches.unit(price) + later)
     expected = costs[0] - np.array(costs)  # the policy's mean is silence
     np.testing.assert_allclose(decisions.advantages.T, expected, rtol=1e-4, atol=1e-4)
@@ -94,7 +98,8 @@ def test_the_cost_of_a_set_is_that_of_a_simulation(
 
 def test_runs_go_on_in_a_branch_or_begin_again() -> None:
     """A run continues within its window, and after its end with a new episode and price."""
-    branches = Branches(env_of("scheduler", 200), 4, 0)
+    branches = Branches(env_of("scheduler", 200), 2.0, 0)
+    longest = branches.windows(np.array(PRICES)).max()
     for _ in range(3):
         left, price = branches.left.copy(), branches.price.copy()
         branches.decide(
@@ -103,7 +108,7 @@ def test_runs_go_on_in_a_branch_or_begin_again() -> None:
         moved = left - branches.left
         begun = branches.left == 12
         assert begun.any()
-        assert {*moved[~begun]} == {1, 2, 3, 4}
+        assert {1, 2, 3} < {*moved[~begun]} <= {*range(1, longest + 1)}
         assert (branches.price[~begun] == price[~begun]).all()
         position = branches.step.moved(branches.rows)[0]
         np.testing.assert_array_equal(position.limit - position.steps, branches.left)
@@ -166,7 +171,7 @@ class Stop(BaseCallback):
     """Ctrl-C in a rollout."""
 
     def _on_step(self) -> bool:
-        if self.n_calls == 5:
+        if self.n_calls == 2:
             os.kill(os.getpid(), signal.SIGINT)
         return True
 
@@ -201,6 +206,6 @@ def test_what_cannot_branch_is_one_error(
 
 def test_sets_of_more_sensors_change_at_most_two_requests() -> None:
     task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", sources=(5, 0), horizon=8)
-    branches = Branches(RuleVecEnv(task, 4, rule="priced_threshold", prices=(1.0,)), 3, 0)
+    branches = Branches(RuleVecEnv(task, 4, rule="priced_threshold", prices=(1.0,)), 2.0, 0)
     assert len(branches.changes) == 1 + 5 + 10
     assert branches.changes.sum(1).max() == 2
