@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -73,8 +73,8 @@ class BranchingJob:
         return {"name": self.name, "timesteps": self.timesteps, "seed": self.seed}
 
 
-def run_branching(job: BranchingJob) -> list[GainRow]:
-    """Train or continue, calibrate, and return the rows of both agents."""
+def run_branching(job: BranchingJob) -> list[tuple[Any, ...]]:
+    """Train or continue, calibrate, and return the entries of the rows of both agents."""
     torch.set_num_threads(1)
     card, zoo_file = zoo.card(job.name), Path(zoo.model_path(job.name))
     rule, folder = read_calibration(zoo_file)[0], job.folder / f"{job.name}_{job.seed}"
@@ -105,7 +105,7 @@ def run_branching(job: BranchingJob) -> list[GainRow]:
         difference, mean = costs(text) - base, base.mean(1)
         reach = 1.96 * difference.std(1, ddof=1) / EPISODES**0.5
         columns = prices, 100 * difference.mean(1) / mean, 100 * reach / mean
-        rows += [GainRow(job.name, policy, *row, trained) for row in zip(*columns, strict=True)]
+        rows += [(job.name, policy, *row, trained) for row in zip(*columns, strict=True)]
     return rows
 
 
@@ -141,7 +141,8 @@ class Branching(Long):
             BranchingJob(name, round(self.share * TIMESTEPS[name]), self.seed, runner.folder)
             for name in self.names
         ]
-        results = runner.run(run_branching, jobs, "classes")
+        entries = runner.run(run_branching, jobs, "classes")
+        results = [[GainRow(*row) for row in rows] for rows in entries]
         with replacing(self.work / "branching.csv") as partial:
             pd.DataFrame([row for rows in results for row in rows]).to_csv(
                 partial, index=False, float_format="%.4g"
@@ -158,6 +159,4 @@ class Branching(Long):
 
 
 if __name__ == "__main__":
-    from agents.branching import Branching as Command  # whose rows other processes can unpickle
-
-    Command.main()
+    Branching.main()
