@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,14 +36,13 @@ from fusion_gym.core.task import Task
 from fusion_gym.entries import State
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import LARGEST_RATIO, append_ratios, space_with_ratios
-from fusion_gym.errors import refusal
+from fusion_gym.errors import forbidden, refusal
 from fusion_gym.evaluation.episodes import run_priced
 from fusion_gym.lowering import LoweringError
 from fusion_gym.namespace import namespace
 from fusion_gym.policies.base import refused_signals
 from fusion_gym.policies.rules import PricedThreshold
 from fusion_gym.policies.saved import calibration_rule
-from fusion_gym.validation import ConfigurationError
 
 MOST_SETS = 64
 _ALL = 3  # sensors of which any requests change; of more, at most two
@@ -157,11 +157,10 @@ class Branches:
 
         task, sensors = env.task, env.task.sensors
         self.env, self.window, self.random = env, window, np.random.default_rng(seed)
-        most = 1 if not env.view.action.bits else sensors if sensors <= _ALL else 2
-        if 1 + sensors + (most > 1) * sensors * (sensors - 1) // 2 > MOST_SETS:
-            raise refusal("sensors", sensors, "at most 10, whose sets of requests branch", "here")
-        every = (np.arange(2**sensors)[:, None] >> np.arange(sensors) & 1).astype(np.bool_)
-        self.changes = every[every.sum(1) <= most]
+        self.changes = changes_of(sensors, env.view.action.bits)
+        if len(self.changes) > MOST_SETS:
+            allowed = f"fewer: {len(self.changes)} sets of requests branch, at most {MOST_SETS}"
+            raise refusal("sensors", sensors, allowed, "with algorithm 'branching_ppo'")
         memory, layout = Memory(task, env.owner), ObservationLayout(task, env.owner)
         try:
             task.refuse_numpy_only()
@@ -169,7 +168,7 @@ class Branches:
             self.step = CompiledStep(task, memory, layout, sizes, RuleSignals(env.rule))
         except LoweringError as error:
             reason = f"machine code does not run it ({error}); use counterfactual_ppo"
-            raise ConfigurationError(f"algorithm = 'branching' is not allowed: {reason}") from None
+            raise forbidden("algorithm", "branching_ppo", reason) from None
         self._prices = np.geomspace(min(env.prices), max(env.prices), _PRICES)
         each = np.repeat(self._prices, _EPISODES)
         numbers = seeds.TUNING.start + np.tile(np.arange(_EPISODES), _PRICES)
@@ -300,6 +299,13 @@ class Branches:
         self._begin(np.flatnonzero(over), self.env.task.horizon)
         real = (torch.as_tensor(part, dtype=torch.float32) for part in (mean - costs, values))
         return BranchedDecisions(observations, privileged, sets, old, *real)
+
+
+def changes_of(sensors: int, several: bool) -> NDArray[np.bool_]:
+    """Return the changes (A, sensors) of requests that branch, of one sensor or of several."""
+    most = 1 if not several else sensors if sensors <= _ALL else 2
+    places = [own for size in range(most + 1) for own in combinations(range(sensors), size)]
+    return np.array([np.isin(np.arange(sensors), own) for own in places])
 
 
 def log_probabilities(logits: torch.Tensor, sets: torch.Tensor) -> torch.Tensor:

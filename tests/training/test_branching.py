@@ -3,6 +3,7 @@
 import copy
 import os
 import signal
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch
 from fusion_gym.evaluation.episodes import run_priced
 from fusion_gym.policies.saved import ModelPolicy, ModelView
-from fusion_gym.training.branching import Branches, BranchingPPO, RuleVecEnv
+from fusion_gym.training.branching import Branches, BranchingPPO, RuleVecEnv, changes_of
 from fusion_gym.validation import ConfigurationError
 
 VALUE = "priced_threshold:score=value,threshold=0.03,reference_price=0.02"
@@ -204,8 +205,15 @@ def test_what_cannot_branch_is_one_error(
     assert not (tmp_path / "run").exists()
 
 
-def test_sets_of_more_sensors_change_at_most_two_requests() -> None:
-    task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", sources=(5, 0), horizon=8)
-    branches = Branches(RuleVecEnv(task, 4, rule="priced_threshold", prices=(1.0,)), 2.0, 0)
-    assert len(branches.changes) == 1 + 5 + 10
-    assert branches.changes.sum(1).max() == 2
+def test_sets_change_all_requests_of_few_sensors_and_at_most_two_of_many() -> None:
+    assert {tuple(own) for own in changes_of(3, True)} == {*product((False, True), repeat=3)}
+    assert len(changes_of(10, True)) == 1 + 10 + 45
+    assert changes_of(10, True).sum(1).max() == 2
+    np.testing.assert_array_equal(changes_of(40, False), np.eye(41, 40, -1, dtype=np.bool_))
+
+
+def test_too_many_sensors_are_one_error() -> None:
+    task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", sources=(12, 0), horizon=8)
+    env = RuleVecEnv(task, 4, rule="priced_threshold", prices=(1.0,))
+    with pytest.raises(ConfigurationError, match=r"sensors = 12 .* 79 sets"):
+        Branches(env, 1.0, 0)
