@@ -497,10 +497,9 @@ def _rule_env(
     """Return the environment of branches, with the rule at which they start."""
     from fusion_gym.training.branching import RuleVecEnv
 
-    if training.error != "squared" or training.error_filter is not None:
-        raise refusal("error", training.error, "'squared'", "with algorithm 'branching_ppo'")
-    if training.price_exponent:
-        raise refusal("price_exponent", training.price_exponent, "0", "with 'branching_ppo'")
+    for name, allowed in (("error", "squared"), ("error_filter", None), ("price_exponent", 0.0)):
+        if (value := getattr(training, name)) != allowed:
+            raise refusal(name, value, repr(allowed), "with algorithm 'branching_ppo'")
     prices = prices_of(task)
     if rule is None:
         search = search_of_class(class_of(task, runs["local"]), task, prices, episodes=(16, 100))
