@@ -60,7 +60,7 @@ class RowStep:
         signals: Callable[[Branch], Sequence[Any]] | None = None,
     ) -> None:
         self.runs, plant, network = (task, memory, layout), task.plant, task.network
-        self.signals = sizes, signals
+        self.sizes, self.signals = sizes, signals
         self.start_noise = np.zeros((plant.start_channels + network.start_channels, 1))
         self.noise = np.zeros((plant.noise_channels + network.noise_channels, 1))
         number, steps = np.zeros(1), np.zeros(1, dtype=np.int64)
@@ -99,7 +99,7 @@ class RowStep:
         ]
 
     def __reduce__(self) -> Any:
-        return type(self), (*self.runs, *self.signals)
+        return type(self), (*self.runs, self.sizes, self.signals)
 
     def __deepcopy__(self, memo: Any) -> RowStep:
         return self  # what it has compiled fits the copy
@@ -144,8 +144,7 @@ class RowStep:
         return [*arrays_of(moved), *after[0], *after[1], *self._observed(branch)]
 
     def _observed(self, branch: Branch) -> list[Any]:
-        signals = self.signals[1]
-        return [branch.observe(), *(signals(branch) if signals else ())]
+        return [branch.observe(), *(self.signals(branch) if self.signals else ())]
 
     def pack(self, position: Position, memory: MemoryStates) -> Array:
         """Return the rows of a position and of the memory's states."""
@@ -282,7 +281,7 @@ class CompiledStep(RowStep):
                 sources = [Buffer(real, self.inputs, self.width), Buffer(real, [self.noise])]
                 sources.insert(1, Buffer(np.dtype(np.int8) if flags else whole, [requests]))
             self._functions[kind] = compile_function(
-                (self.runs[0], self.runs[1].owner, kind, self.signals),
+                (self.runs[0], self.runs[1].owner, kind, self.sizes, self.signals),
                 self.start_arrays if kind == "start" else self.step_arrays,
                 sources,
                 [Buffer(real, self.arrays, self.width)],

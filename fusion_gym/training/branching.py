@@ -31,7 +31,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.knowledge import covers
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.runs import Branch
+from fusion_gym.core.runs import Runs
 from fusion_gym.core.task import Task
 from fusion_gym.entries import State
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
@@ -61,12 +61,12 @@ class RuleSignals:
 
     rule: PricedThreshold
 
-    def __call__(self, branch: Branch) -> Sequence[Any]:
+    def __call__(self, runs: Runs) -> Sequence[Any]:
         """Return the arrays of runs."""
         rule, task = self.rule, self.rule.task
         local = not covers(rule.knowledge, "centre")
-        ratio = rule.log_ratio(branch.signals().limit(refused_signals(rule, task), local))
-        state, xp = branch.state, namespace(ratio)
+        ratio = rule.log_ratio(runs.signals().limit(refused_signals(rule, task), local))
+        state, xp = runs.state, namespace(ratio)
         error = task.plant.truth(state.plant) - task.estimator.mean(state.estimate)
         shape = task.sensors, error.shape[-1]
         ratio = xp.clip(xp.broadcast_to(ratio, shape), -LARGEST_RATIO, LARGEST_RATIO)
@@ -102,7 +102,7 @@ class RuleVecEnv(FusionSB3VecEnv):
 
     def snapshot(self) -> State:
         """Return the state of all runs and branches for :meth:`restore`."""
-        return super().snapshot() | {"branches": self.branches and self.branches.moving}
+        return super().snapshot() | {"branches": self.branches and self.branches.changing_state}
 
     def restore(self, snapshot: State) -> None:
         """Set all runs and branches to a :meth:`snapshot`."""
@@ -110,8 +110,7 @@ class RuleVecEnv(FusionSB3VecEnv):
         vars(self.branches).update(snapshot["branches"])
 
     def _observe(self) -> NDArray[np.float32]:
-        signals = self.batch.signals().limit(refused_signals(self.rule, self.task), self.view.local)
-        return append_ratios(super()._observe(), self.rule.log_ratio(signals).T)
+        return append_ratios(super()._observe(), RuleSignals(self.rule)(self.batch)[0].T)
 
 
 class BranchedDecisions(NamedTuple):
@@ -180,13 +179,13 @@ class Branches:
         self._weights = np.sqrt(weights if weights.ndim == 1 else weights.diagonal())
         runs = np.arange(env.runs)
         self.rows = np.empty((env.runs, self.step.width))
-        self._rooms = np.empty((2, env.runs * len(self.changes), self.step.width))
+        self._buffers = np.empty((2, env.runs * len(self.changes), self.step.width))
         self.timesteps = 0
         self.price, self.left = np.ones(env.runs), np.zeros(env.runs, dtype=np.int64)
         self._begin(runs, self.random.integers(1, task.horizon + 1, env.runs))
 
     @property
-    def moving(self) -> State:
+    def changing_state(self) -> State:
         """What a step changes."""
         return {name: vars(self)[name] for name in ("random", "rows", "price", "left")}
 
@@ -242,7 +241,7 @@ class Branches:
         logits_of: Callable[[torch.Tensor], torch.Tensor],
         value_of: Callable[[torch.Tensor], torch.Tensor],
     ) -> BranchedDecisions:
-        """Branch the decisions of all runs, and move each run into its taken branch.
+        """Branch the decisions of all runs, and move each run into the branch that it chooses.
 
         Args:
             logits_of: function from observations to the logits (B, sensors) of requests.
@@ -257,14 +256,14 @@ class Branches:
         sets = torch.as_tensor(own, dtype=torch.float32)
         old = log_probabilities(logits, sets)
         noise = self.random.gumbel(size=old.shape)
-        taken = (old.numpy() + noise).argmax(1)
+        choice = (old.numpy() + noise).argmax(1)
         window, unit = self.windows(self.price), self.unit(self.price)
         moment = np.ceil(self.random.random(count) * window)  # at which a run goes on
         cost, steps, over = np.zeros((count, width)), np.zeros(count, np.int64), moment < 0
         run, branch = np.indices((count, width)).reshape(2, -1)  # of each lane
-        first, second = self._rooms  # memory that is used again
+        first, second = self._buffers  # memory that is used again
         lanes = np.take(self.rows, run, axis=0, out=first, mode="clip")
-        requests, moved = own[run, branch], self.rows.copy()
+        requests, successor = own[run, branch], self.rows.copy()
         for step in range(1, window.max() + 1):
             if step > 1:
                 requests = self.requests(logits_of(self.observations(lanes)))
@@ -276,10 +275,10 @@ class Branches:
             outcome = self.step.outcome(after)
             charge = self.price[run] * outcome.cost - outcome.reward_error
             cost[run, branch] += charge / unit[run]
-            leaves = (branch == taken[run]) & (steps[run] == 0)
+            leaves = (branch == choice[run]) & (steps[run] == 0)
             leaves &= outcome.ended | (moment[run] == step)
             place = run[leaves]
-            moved[place], over[place], steps[place] = after[leaves], outcome.ended[leaves], step
+            successor[place], over[place], steps[place] = after[leaves], outcome.ended[leaves], step
             last = ~outcome.ended & (window[run] == step)
             left = self.left[run[last]] - step
             end = value_of(self.privileged(after[last], self.price[run[last]], left)).numpy()
@@ -295,7 +294,7 @@ class Branches:
         costs = np.nan_to_num(cost, nan=1e6, posinf=1e6)
         mean = (np.exp(old.numpy()) * costs).sum(1, keepdims=True)
         values = (mean[:, 0] - self.left) / _VALUE
-        self.rows, self.left = moved, self.left - steps
+        self.rows, self.left = successor, self.left - steps
         self._begin(np.flatnonzero(over), self.env.task.horizon)
         real = (torch.as_tensor(part, dtype=torch.float32) for part in (mean - costs, values))
         return BranchedDecisions(observations, privileged, sets, old, *real)
@@ -405,7 +404,7 @@ class BranchingPPO(PPO):
                 parameter.grad *= mask
             for network in (self.policy, self.critic):
                 nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
-            for optimizer in optimizers[left > 1.0 - _ALONE :]:
+            for optimizer in optimizers if left <= 1.0 - _ALONE else optimizers[1:]:
                 optimizer.step()
             entries.append([part.item() for part in (policy, value, -entropy, spread)])
             self._n_updates += 1

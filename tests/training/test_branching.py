@@ -19,7 +19,8 @@ from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch
 from fusion_gym.evaluation.episodes import run_priced
-from fusion_gym.policies.saved import ModelPolicy, ModelView
+from fusion_gym.evaluation.onnx_export import export_onnx
+from fusion_gym.policies.saved import ModelPolicy, ModelView, tag_model
 from fusion_gym.training.branching import Branches, BranchingPPO, RuleVecEnv, changes_of
 from fusion_gym.validation import ConfigurationError
 
@@ -152,6 +153,17 @@ def test_a_trained_agent_is_a_file_like_any_other(case: str, tmp_path: Path) -> 
     np.testing.assert_array_equal(means.cost(each)[3:6], same.cost(0.1)[3:6])
     rest = fusion_gym.evaluation.run_episodes(task, agent, 3, seed=0)
     assert np.isfinite(rest.returns).all()
+    with pytest.raises(ConfigurationError, match="rule"):
+        export_onnx(agent, task, str(tmp_path / "agent.onnx"), experiment.environment.id)
+
+
+def test_a_file_names_no_policy_that_may_run_code(tmp_path: Path) -> None:
+    env = env_of("scheduler")
+    model = BranchingPPO("MlpPolicy", env, policy_kwargs=SILU)
+    tag_model(model, env.task, rule="model:other.zip")
+    model.save(tmp_path / "agent.zip")
+    with pytest.raises(ConfigurationError, match="rule = 'model:other"):
+        fusion_gym.make_policy(f"model:{tmp_path / 'agent.zip'}", env.task)
 
 
 @pytest.mark.slow
