@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[Any]  # constants and names
-MOST_INSTRUCTIONS = 50_000
 _FEW = 8  # a choice among more numbers reads them from memory
 _BOOL, _WHOLE = np.dtype(np.bool_), np.dtype(np.int64)
 
@@ -86,10 +85,10 @@ MOVES: dict[str, Callable[..., Any]] = {
 
 
 class Program:
-    """The lines of a function in LLVM's assembly."""
+    """The lines of a function in LLVM's assembly, at most so many."""
 
-    def __init__(self) -> None:
-        self.lines: list[str] = []
+    def __init__(self, most: int) -> None:
+        self.most, self.lines = most, list[str]()
         self.first: list[str] = []  # of the entry block
         self.outside: dict[str, str] = {}  # names of declarations and tables
         self.label = "entry"
@@ -105,8 +104,8 @@ class Program:
         if text not in self._known:
             self._known[text] = name = self.name()
             self.lines.append(f"{name} = {text}")
-            if len(self.lines) > MOST_INSTRUCTIONS:
-                raise LoweringError(f"it has more than {MOST_INSTRUCTIONS:,} instructions")
+            if len(self.lines) > self.most:
+                raise LoweringError(f"it has more than {self.most:,} instructions")
         return self._known[text]
 
     def block(self, label: str) -> None:
@@ -487,18 +486,19 @@ class Buffer(NamedTuple):
             yield array, [address() for _ in range(math.prod(array.shape))]
 
 
-def assembly(closed: Any, sources: Sequence[Buffer], sinks: Sequence[Buffer]) -> str:
+def assembly(closed: Any, sources: Sequence[Buffer], sinks: Sequence[Buffer], most: int) -> str:
     """Return the function ``step(runs, sources, sinks)`` of a jaxpr of one run.
 
     Args:
         closed: The jaxpr; its arguments and results are the arrays of the buffers in turn.
         sources: Memory of the arguments.
         sinks: Memory of the results.
+        most: Number of instructions that is allowed.
 
     Raises:
         LoweringError: A primitive is unknown, or the program is too long.
     """
-    code, inputs, pointers = Program(), [], []
+    code, inputs, pointers = Program(most), [], []
     code.block("each")
     for number, buffer in enumerate(sources):
         text, pointer = _type(buffer.kind), f"%source{number}"

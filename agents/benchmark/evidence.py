@@ -37,9 +37,7 @@ REFERENCE = "rule"
 TRIGGERS = "printed", "trigger"
 SAVINGS = "printed", "thresholds", REFERENCE, "informed", "learned"
 FRESH = seeds.TUNING[10_000]  # first of the episodes that choose among tuned policies
-# By the kind of the agent alone.
-CALIBRATED = {"agent": "calibrated", "other": "other_calibrated"}
-LEARNED = {"agent": "learned", "other": "other_learned"}
+CALIBRATED = {"agent": "calibrated", "other": "other_calibrated"}  # by the kind of the agent alone
 
 
 class TestRow(NamedTuple):
@@ -107,6 +105,7 @@ class TrainingRow(NamedTuple):
     timesteps: int
     seconds: float
     calibration_seconds: float
+    best: bool  # its policy is the learned policy of its seed
     rule_points: int  # prices at which the learned policy is a rule
     agent: float
     learned: float
@@ -225,15 +224,27 @@ class Evidence:
         return tuple(self.tests[kind][0][k] for k, kind in enumerate(self.references))
 
     @property
-    def best_seed(self) -> int:
-        """Seed of the training whose calibrated policy costs least on its tuning episodes."""
-        costs = [item.calibration.relative_cost for item in self.trainings["agent"]]
-        return int(np.argmin(costs))
+    def best_of_seeds(self) -> list[tuple[str, int]]:
+        """Kind and number of each seed's training whose calibrated policy costs least in tuning."""
+        count = len(self.trainings["agent"])
+        return [min(((k, seed) for k in self.trainings), key=self._cost) for seed in range(count)]
 
     @property
-    def best(self) -> Trained:
-        """Training with that seed."""
-        return self.trainings["agent"][self.best_seed]
+    def best(self) -> tuple[str, int]:
+        """Kind and number of the training that costs least among these."""
+        return min(self.best_of_seeds, key=self._cost)
+
+    def training(self, kind: str, seed: int) -> Trained:
+        """Return a training."""
+        return self.trainings[kind][seed]
+
+    def learned(self, kind: str, seed: int) -> TestResults:
+        """Return the results of the learned policy of a training."""
+        own = self.tests[CALIBRATED[kind]][seed]
+        return self.training(kind, seed).learned(own, self.reference, range(len(own)))
+
+    def _cost(self, place: tuple[str, int]) -> float:
+        return self.training(*place).calibration.relative_cost
 
 
 def hash_of(file: Path) -> str:
@@ -254,10 +265,7 @@ def gather(suite: Suite, runner: Runner) -> list[Evidence]:
     places = [(item, kind, texts) for item in classes for kind, texts in policies_of(item)]
     test_all(suite, runner, places)
     for item in classes:
-        for kind, every in item.trainings.items():
-            pairs = zip(every, item.tests[CALIBRATED[kind]], strict=True)
-            own = [t.learned(o, item.reference, range(len(o))) for t, o in pairs]
-            item.tests[LEARNED[kind]] = own
+        item.tests["learned"] = [item.learned(*place) for place in item.best_of_seeds]
     test_informed(suite, runner, classes)
     test_cases(suite, runner, [item for item in classes if item.name == "scheduler"])
     return classes
@@ -347,13 +355,12 @@ def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> N
     """Train and calibrate the agents of all classes, and the other algorithm's."""
     places = []
     for item in classes:
-        own = item.setting, item.name
-        for kind, (algorithm, steps) in suite.algorithms(*own).items():
-            for seed in range(suite.seeds(*own)):
-                folder = f"{item.setting.name}_{item.name}_{algorithm.name}_{seed}"
-                experiment = suite.experiment(*own, item.prices, seed, algorithm, steps)
-                weight = float(item.setting.seconds[item.name])
-                job = TrainingJob(experiment, runner.folder / "agents" / folder, weight)
+        own = item.setting, item.name, item.prices
+        for kind, algorithm in zip(CALIBRATED, item.setting.timesteps[item.name], strict=False):
+            for seed in range(suite.training_seeds):
+                experiment = suite.experiment(*own, seed, algorithm, item.rule)
+                folder = f"{item.setting.name}_{item.name}_{algorithm}_{seed}"
+                job = TrainingJob(experiment, runner.folder / "agents" / folder)
                 places.append((item, kind, job))
     spent = runner.run(run_training, [job for _, _, job in places], "trainings")
     calibrations = [
@@ -425,16 +432,17 @@ def test_cases(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> Non
     jobs: list[verdict.TestJob] = []
     middle = range(1, 4)  # places of prices
     for item in classes:
-        prices, learned = item.prices[1:4], f"model:{item.best.policy},price={{price}}"
+        prices, learned = item.prices[1:4], item.training(*item.best)
+        text = f"model:{learned.policy},price={{price}}"
         rules = [item.rules[item.references[k]][k] for k in middle]
         for case in (None, *suite.cases_of(item.setting)):
             places.append((item, "as assumed" if case is None else case.name))
-            for texts in (rules, [learned] * 3):
+            for texts in (rules, [text] * 3):
                 jobs.append(item.test(texts, suite.case_episodes, case, prices))
     results = runner.run(verdict.run_test, jobs, "perturbed cases")
     for place, (item, name) in enumerate(places):
         rule, own = results[2 * place], results[2 * place + 1]
-        item.cases[name] = rule, item.best.learned(own, rule, middle)
+        item.cases[name] = rule, item.training(*item.best).learned(own, rule, middle)
 
 
 def check_policy(suite: Suite, text: str, name: ClassName) -> None:
@@ -546,13 +554,14 @@ def training_rows(classes: Sequence[Evidence]) -> list[TrainingRow]:
         for kind, every in item.trainings.items():
             for seed, trained in enumerate(every):
                 agent, learned = (
-                    mean_difference([([item.tests[name][seed]], item.reference)]).mean
-                    for name in (kind, LEARNED[kind])
+                    mean_difference([([own], item.reference)]).mean
+                    for own in (item.tests[kind][seed], item.learned(kind, seed))
                 )
                 experiment = trained.job.experiment
                 place = item.setting.name, item.name, kind, experiment.algorithm.name, seed
                 work = experiment.training.timesteps, trained.seconds, trained.calibration.seconds
-                rows.append(TrainingRow(*place, *work, trained.rule_points, agent, learned))
+                best = (kind, seed) in item.best_of_seeds
+                rows.append(TrainingRow(*place, *work, best, trained.rule_points, agent, learned))
     return rows
 
 

@@ -87,12 +87,11 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
     for name, title in titles.items():
         draw_setting([row for row in results.policies if row.setting == name], title, folder)
     headline = headline_text(suite.settings, results)
-    short, long = suite.training_seeds
     named = {kind for setting in suite.settings for kind in setting.named_rules}
     page = [
         f"# {suite.title}",
         f"Results of `{suite.command}` in version {__version__}: {suite.episodes:,} test episodes, "
-        f"{long} trainings of an agent, {short} where one takes less than a minute. "
+        f"{suite.training_seeds} trainings of an agent by each algorithm. "
         f"[Method]({'../' * len(folder.parts)}docs/benchmark.md).",
         headline,
         "## Against the best rule",
@@ -102,10 +101,9 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
         "\n".join(f"- **{TITLES[name]}**: {KNOWLEDGE[name]}." for name in CLASSES),
         class_table(titles, results),
         "\n".join(f"- {text}" for text in sentences(results)),
-        "## What credit and calibration add",
-        f"Counterfactual credit and `{suite.comparison.algorithm.name}` with the same processor "
-        "time, alone and calibrated with the searched rule. Seconds of one training; cost over the "
-        "best rule's, %.",
+        "## Two algorithms",
+        "Both with the same processor time, alone and calibrated with the searched rule. Seconds "
+        "of one training; cost over the best rule's, %.",
         comparison_table(titles, results),
         "## Rules of the literature" if named else "",
         table(
@@ -158,23 +156,23 @@ def interval(
 def headline_text(settings: Sequence[Setting], results: Results) -> str:
     """Return the table of what tuning, knowledge and learning save, a row for each setting."""
     kinds = "printed", "thresholds", "rule", "informed", "learned", "bound"
-    trainings, shares = grouped(results.trainings), len({row.share for row in results.policies})
+    shares = len({row.share for row in results.policies})
     by_kind = {(row.setting, row.kind): row for row in results.savings}
+    every = [row for row in results.trainings if row.best]
     cells = []
     for setting in settings:
         own = [by_kind.get((setting.name, kind)) for kind in kinds]
         savings = [interval(row, row.saving).removeprefix("+") if row else "–" for row in own]
-        agents = trainings[setting.name, setting.headline, "agent"]
-        points = f"{np.mean([row.rule_points for row in agents]):.1f}"
+        place = setting.name, setting.headline
+        points = [row.rule_points for row in every if (row.setting, row.name) == place]
         knows = f"{setting.trigger_title}, {TITLES[setting.headline]}"
-        cells.append((setting.title, knows, *savings, points))
+        cells.append((setting.title, knows, *savings, f"{np.mean(points):.1f}"))
     medians = (
         100.0 * float(np.median([r.saving for r in results.savings if r.kind == kind] or [np.nan]))
         for kind in kinds[:4]
     )
     printed, thresholds, rule, informed = medians
     gains = [-row.difference for row in results.classes if row.kind == "learned"]
-    every = [row for row in results.trainings if row.kind == "agent"]
     text = (
         "Cost saved against the setting's own trigger, whose parameters are tuned with as many "
         "episodes as the searched rule: % with a 95 % bootstrap interval over seeds and episodes, "
@@ -196,7 +194,7 @@ def headline_text(settings: Sequence[Setting], results: Results) -> str:
 def class_table(titles: dict[str, str], results: Results) -> str:
     """Return the table of every kind of policy relative to the best tuned rules."""
     by_kind = {(row.setting, row.name, row.kind): row for row in results.classes}
-    trainings, shares = grouped(results.trainings), len({row.share for row in results.policies})
+    shares = len({row.share for row in results.policies})
     lines = []
     for place in dict.fromkeys((row.setting, row.name) for row in results.classes):
         cells = [
@@ -205,12 +203,15 @@ def class_table(titles: dict[str, str], results: Results) -> str:
         ]
         best = by_kind.get((*place, "optimum")) or by_kind.get((*place, "bound"))
         limit = f"{best.kind} {mean_text(best)}" if best else "–"
-        own = trainings[*place, "agent"]
+        trainings = [row for row in results.trainings if (row.setting, row.name) == place]
+        own = [row for row in trainings if row.best]
+        algorithms = ", ".join(dict.fromkeys(row.algorithm for row in trainings))
         rule = f"{sum(row.rule_points for row in own)} of {len(own) * shares}"
-        lines.append((titles[place[0]], TITLES[place[1]], *cells, limit, rule))
+        lines.append((titles[place[0]], TITLES[place[1]], algorithms, *cells, limit, rule))
     heads = (
-        *("setting", "class", "learned policy", "agents alone", "searched rule", "one threshold"),
-        *("a threshold a sensor", "tuned trigger", "optimum or bound", "points with a rule"),
+        *("setting", "class", "trained by", "learned policy", "agents alone", "searched rule"),
+        *("one threshold", "a threshold a sensor", "tuned trigger", "optimum or bound"),
+        "points with a rule",
     )
     return table(heads, lines)
 
@@ -271,11 +272,8 @@ def sentences(results: Results) -> list[str]:
     points = [point for point in results.points if point.kind == "learned"]
     fewer = sum(point.discovery and point.difference < 0.0 for point in points)
     more = sum(point.discovery and point.difference > 0.0 for point in points)
-    costs = [
-        [row.learned for row in own]
-        for (_, _, kind), own in grouped(results.trainings).items()
-        if kind == "agent"
-    ]
+    best = pd.DataFrame([row for row in results.trainings if row.best])
+    costs = best.groupby(["setting", "name"]).learned.apply(list).tolist()
     near = sum(max(own) - min(own) <= 0.02 for own in costs)
     return [
         f"The mean over {len(costs)} classes is {mean('learned')} for learned policies and "

@@ -25,7 +25,6 @@ from fusion_gym.validation import choice
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)
 SuiteName = Literal["settings", "channels"]
 FILE = Path(__file__).with_name("settings.yaml")
-SHORT = 60  # seconds of a short training
 
 
 class Case(Strict):
@@ -55,8 +54,9 @@ class Setting(Strict):
 
     ``printed`` is the trigger with the paper's parameters, ``headline`` the class of its knowledge.
     ``named_rules`` are tested by their titles like the trigger. ``prices`` has a list
-    for each class, ``seconds`` about the length of a training in a class. ``optimum`` is a policy
-    with ``{price}``.
+    for each class, ``timesteps`` the length of a training by each of its algorithms, of which the
+    first trains the agents. ``num_envs`` and ``error`` count without branches.
+    ``optimum`` is a policy with ``{price}``.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -73,8 +73,7 @@ class Setting(Strict):
     agent_options: Options = pydantic.Field(default_factory=dict)
     memory: bool = True
     optimum: str | None = None
-    timesteps: Positive
-    seconds: dict[ClassName, Positive]
+    timesteps: dict[ClassName, dict[str, Positive]]
     num_envs: Positive = 1024
     error: Literal["squared", "excess", "mismatch"] = "mismatch"
     cases: tuple[Case, ...] = ()
@@ -108,19 +107,8 @@ class Setting(Strict):
         return _perturbed(options, case)
 
 
-class OtherAlgorithm(Strict):
-    """Another algorithm, in classes of some settings, with a factor of each one's time steps."""
-
-    algorithm: AnyAlgorithm
-    names: tuple[ClassName, ...]
-    steps: dict[str, Rate]
-
-
 class Suite(Strict):
-    """The whole benchmark; ``steps`` multiplies the lengths of all trainings.
-
-    ``training_seeds`` are the numbers of short trainings and of others.
-    """
+    """The whole benchmark; ``steps`` multiplies the lengths of all trainings."""
 
     title: str
     command: str
@@ -129,10 +117,9 @@ class Suite(Strict):
     calibration_episodes: tuple[Positive, Positive]
     case_episodes: Positive
     generations: Positive
-    training_seeds: tuple[Positive, Positive]
+    training_seeds: Positive
     shares: tuple[Share, ...]
-    algorithm: AnyAlgorithm
-    comparison: OtherAlgorithm
+    algorithms: tuple[AnyAlgorithm, ...]
     steps: Rate = 1.0
     rules: tuple[ThresholdRule, ...]
     cases: tuple[Case, ...]
@@ -142,45 +129,36 @@ class Suite(Strict):
         """Return the perturbed cases of a setting."""
         return setting.cases or self.cases
 
-    def seeds(self, setting: Setting, name: ClassName) -> int:
-        """Return the number of trainings of a class."""
-        short, long = self.training_seeds
-        return short if setting.seconds[name] < SHORT else long
-
-    def algorithms(
-        self, setting: Setting, name: ClassName
-    ) -> dict[str, tuple[AnyAlgorithm, float]]:
-        """Return the algorithms of a class by kind, each with the factor of its time steps."""
-        result: dict[str, tuple[AnyAlgorithm, float]] = {"agent": (self.algorithm, 1.0)}
-        if name in self.comparison.names and setting.name in self.comparison.steps:
-            result["other"] = self.comparison.algorithm, self.comparison.steps[setting.name]
-        return result
-
     def experiment(
         self,
         setting: Setting,
         name: ClassName,
         prices: tuple[float, ...],
         seed: int,
-        algorithm: AnyAlgorithm,
-        steps: float,
+        algorithm: str,
+        rule: str,
     ) -> config.Experiment:
-        """Return the training of one agent at random prices, with a factor of its time steps."""
-        timesteps = max(round(setting.timesteps * self.steps * steps), 1)
+        """Return the training of one agent at random prices, from a rule if it branches."""
+        (settings,) = (item for item in self.algorithms if item.name == algorithm)
+        timesteps = max(round(setting.timesteps[name][algorithm] * self.steps), 1)
+        training = config.TrainingConfig(
+            timesteps=timesteps,
+            num_envs=setting.num_envs,
+            seed=seed,
+            price_exponent=0.8,
+            error=setting.error,
+        )
+        if isinstance(settings, config.BranchingConfig):
+            settings = settings.model_copy(update={"rule": rule})
+            training = config.TrainingConfig(timesteps=timesteps, num_envs=128, seed=seed)
         return config.Experiment(
             environment=config.EnvironmentConfig(
                 id=setting.environment,
                 options=setting.agent_environment(name, (min(prices), max(prices))),
                 local=name == "local",
             ),
-            algorithm=algorithm,
-            training=config.TrainingConfig(
-                timesteps=timesteps,
-                num_envs=setting.num_envs,
-                seed=seed,
-                price_exponent=0.8,
-                error=setting.error,
-            ),
+            algorithm=settings,
+            training=training,
             validation=config.ValidationConfig(every=max(timesteps // 3, 1), episodes=256),
             calibration=None,
             output="agent",

@@ -10,6 +10,7 @@ import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
@@ -22,11 +23,11 @@ from fusion_gym.validation import ConfigurationError
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """A training; checkpoints and models are in the folder, ``weight`` is about its seconds."""
+    """A training; checkpoints and models are in the folder."""
 
     experiment: Experiment
     folder: Path
-    weight: float
+    weight: ClassVar[float] = 100.0
 
     @property
     def inputs(self) -> Plain:

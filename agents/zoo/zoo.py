@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from agents.benchmark.evidence import Evidence, gather
+from agents.benchmark.evidence import CALIBRATED, Evidence, gather
 from agents.benchmark.jobs import Runner
 from agents.benchmark.settings import Suite, knowledge_of, load_suite
 from agents.workers import Pool
@@ -46,7 +46,9 @@ class Zoo(Long):
             f"{item.setting.name}_{item.name}": item
             for item in gather(suite, Runner(work, Pool(self.workers)))
         }
-        models = {name: item.best.policy.read_bytes() for name, item in classes.items()}
+        models = {
+            name: item.training(*item.best).policy.read_bytes() for name, item in classes.items()
+        }
         writing((f"{len(models)} agents with their cards", self.zoo))
         for name, item in classes.items():
             write(self.zoo / f"{name}.json", agent_card(suite, item, models[name]))
@@ -59,8 +61,8 @@ class Zoo(Long):
 
 def agent_card(suite: Suite, item: Evidence, model: bytes) -> Plain:
     """Return the content of an agent's JSON."""
-    seed = item.best_seed
-    experiment = item.best.job.experiment
+    kind, seed = item.best
+    experiment = item.training(kind, seed).job.experiment
     options = dict(experiment.environment.options)
     for name in ("cost_weight", "price_range"):
         options.pop(name)
@@ -84,7 +86,7 @@ def agent_card(suite: Suite, item: Evidence, model: bytes) -> Plain:
                     "mse": outcome.mse,
                     "rate": outcome.rate,
                 }
-                for outcome in item.tests["calibrated"][seed]
+                for outcome in item.tests[CALIBRATED[kind]][seed]
             ],
         },
     }

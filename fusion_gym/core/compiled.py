@@ -36,6 +36,9 @@ from fusion_gym.importing import require
 from fusion_gym.lowering import Buffer, LoweringError, assembly
 from fusion_gym.namespace import namespace
 
+MOST_INSTRUCTIONS = 50_000  # LLVM takes about ten seconds
+MOST_OF_TRAINING = 250_000  # about a minute, once
+
 
 class RowStep:
     """A step between rows (N, entries), and the places of a row's arrays.
@@ -285,6 +288,7 @@ class CompiledStep(RowStep):
                 self.start_arrays if kind == "start" else self.step_arrays,
                 sources,
                 [Buffer(real, self.arrays, self.width)],
+                MOST_INSTRUCTIONS if self.signals is None else MOST_OF_TRAINING,
             )
         return self._functions[kind]
 
@@ -310,6 +314,7 @@ def compile_function(
     function: Callable[..., list[Any]],
     sources: Sequence[Buffer],
     sinks: Sequence[Buffer],
+    most: int = MOST_INSTRUCTIONS,
 ) -> Any:
     """Return a function ``(runs, sources, sinks)`` in machine code.
 
@@ -318,6 +323,7 @@ def compile_function(
         function: A function of the arrays of one run.
         sources: Memory of these arrays, each alone or all of a row.
         sinks: Memory of the results.
+        most: Number of instructions that is allowed.
 
     Raises:
         LoweringError: JAX cannot trace it, or it is not lowered.
@@ -334,7 +340,7 @@ def compile_function(
         except Exception as error:  # of a user's plant, estimator or rule
             text = " ".join(f"{type(error).__name__}: {error}".split())
             raise LoweringError(f"JAX cannot trace it ({text[:200]})") from error
-        return assembly(closed, sources, sinks)
+        return assembly(closed, sources, sinks, most)
 
     pointers = [ctypes.c_void_p] * (len(sources) + len(sinks))
     with _LOCK:
