@@ -14,7 +14,6 @@ The output folder contains ``report.html``, ``report.md``, two pictures, the opt
 """
 
 import json
-import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -83,7 +82,7 @@ class Field(FitOptions, Long):
         names = [channel.name for channel in recording.channels]
         tolerance = tolerances(self.tolerance, names) if self.tolerance else ()
         seconds = recording.interval.total_seconds()
-        longest = field_report.longest_interval(self.device, seconds) if self.device else math.inf
+        longest = field_report.longest_interval(self.device, seconds)
         inputs: Plain = {"log": joblib.hash(whole.values), "device": self.device}
         inputs |= {"tolerance": tolerance} if tolerance else {"target_rate": rate}
         inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
@@ -108,7 +107,7 @@ class Field(FitOptions, Long):
             shape=tolerance or plant.typical_changes, horizon=horizon,
             source="resampled" if complete >= _COMPLETE else "normal", tolerance=tolerance,
             steps=tuple(field_report.step_of(self.device, c.unit) for c in recording.channels),
-            longest=longest, trials=self.output / "trials",
+            lengths=(rows, len(values) - rows), longest=longest, trials=self.output / "trials",
         )  # fmt: skip
         log = self.log if self.log in SHIPPED else str(Path(self.log).absolute())
         copy = None
@@ -225,7 +224,5 @@ def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodP
     if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
         raise KeyboardInterrupt
     rule, priced = f"model:{folder / 'best_model.zip'}", {**drawn, "reward_scale": 1.0}
-    return [
-        study.call(field_study.point_at, [price], "joint", priced, f"{rule},price={price!r}")
-        for price in prices
-    ]
+    rules = [([price], "joint", priced, f"{rule},price={price!r}") for price in prices]
+    return field_study.measured(study, rules, None if study.tolerance else len(rules) // 2)

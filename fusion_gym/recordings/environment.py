@@ -58,9 +58,10 @@ class RecordedFusionOptions(LinearFusionOptions):
     """Path of the log, a CSV file, or the name of a shipped log: ``"mast"`` or ``"tanks"``."""
     fit_share: float = 0.5
     """Share of the log, from its start, that was fitted."""
-    source: Literal["recorded", "resampled", "normal"] = "recorded"
-    """Source of the process noise: ``"recorded"`` replays the windows. ``"resampled"`` draws from
-    the residuals of the fitted part, for training. ``"normal"`` draws from the plant's model."""
+    source: Literal["recorded", "fitted", "resampled", "normal"] = "recorded"
+    """Source of the process noise: ``"recorded"`` replays the windows, ``"fitted"`` those of the
+    fitted part. ``"resampled"`` draws from the residuals of the fitted part, for training.
+    ``"normal"`` draws from the plant's model."""
 
     def nominal(self) -> RecordedFusionOptions:
         """Return the options whose simulation scales the reward."""
@@ -244,7 +245,8 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     noise = {
         "normal": lambda: None,
         "resampled": lambda: ResampledNoise(_residuals(plant, part)),
-        "recorded": lambda: _windows(plant, part, choice.horizon),
+        "recorded": lambda: _windows(plant, part, choice.horizon, slice(part.rows, None)),
+        "fitted": lambda: _windows(plant, part, choice.horizon, slice(part.rows)),
     }[choice.source]()
     recorded = RecordedPlant(**{item.name: getattr(truth, item.name) for item in fields(truth)})
 
@@ -316,21 +318,21 @@ def _residuals(plant: LinearPlant, part: _Part) -> Array:
     return noise
 
 
-def _windows(plant: LinearPlant, part: _Part, horizon: int) -> WindowNoise:
-    """Return the windows of the part that was not fitted."""
-    values, rows, count = part.values, part.rows, len(part.names)
+def _windows(plant: LinearPlant, part: _Part, horizon: int, rows: slice) -> WindowNoise:
+    """Return the windows of some rows."""
+    values, count = part.values, len(part.names)
     order = plant.size // count
-    path, known = _states(values, order)[rows:], np.isfinite(values[rows:])
+    path, known = _states(values, order)[rows], np.isfinite(values[rows])
     gaps = np.where(known, 0.0, np.nan)
     steps = np.hstack([_noises(plant, path, count), gaps[1:]])
     starts = np.arange(order - 1, len(path) - horizon - 1, horizon + 1)
     present = np.array([known[first : first + horizon + 1].mean() for first in starts])
     starts = starts[present >= _READINGS * known.mean()]
     if not len(starts):
-        allowed = f"shorter: {len(path):,} steps of the log were not fitted"
+        allowed = f"shorter: this part of the log has {len(path):,} steps"
         raise refusal("horizon", horizon, allowed)
     root = plant.initial_factor[..., 0]
     moved = (path[starts] - plant.initial_mean[:, 0]) @ np.linalg.pinv(root).T
-    still, day = np.zeros_like(moved), part.day[rows:][starts, None]
+    still, day = np.zeros_like(moved), part.day[rows][starts, None]
     start = np.hstack([still, moved, gaps[starts], day])
     return WindowNoise(start, steps, starts, plant.noise_channels)

@@ -118,8 +118,8 @@ ATTRIBUTES = {
 }  # fmt: skip
 
 
-def longest_interval(device: DeviceName, seconds: float) -> int:
-    """Return the most steps between two reports that a device holds.
+def longest_interval(device: DeviceName | None, seconds: float) -> float:
+    """Return the most steps between two reports that a device holds, or that each device holds.
 
     Args:
         device: kind of the device.
@@ -128,11 +128,14 @@ def longest_interval(device: DeviceName, seconds: float) -> int:
     Raises:
         ConfigurationError: the device cannot hold one step.
     """
+    if device is None:
+        return min((high // seconds for low, high, _ in DEVICES.values() if low <= seconds <= high),
+                   default=np.inf)  # fmt: skip
     low, high, _ = DEVICES[device]
     if not low <= seconds <= high:
         allowed = f"a device with an interval of {seconds:g} s, not from {low:g} to {high:g} s"
         raise refusal("device", device, allowed)
-    return int(high // seconds)
+    return high // seconds
 
 
 def step_of(device: DeviceName | None, unit: str) -> tuple[float, float]:
@@ -202,21 +205,18 @@ class FieldReport:
         """The method without a downlink that has the least error, or packets in the tolerance."""
         local = [name for name in METHODS if name != "centralised"]
         if self.study.tolerance:
-            return min(local, key=lambda name: self.study.order(self.point(name)))
+            return min(local, key=lambda name: self.point(name).order)
         errors = {row.name: row.error for row in self.results}
         return min(local, key=errors.__getitem__)
 
     def point(self, name: str) -> MethodPoint:
         """Return a method's point at the target."""
-        points = self.points[name]
-        if self.study.tolerance:
-            return min(points, key=self.study.order)
-        return points[len(points) // 2]
+        return next(point for point in self.points[name] if point.packets)
 
     def packets_a_day(self, name: str) -> Array:
         """Return the packets a day of each sensor (sensors,)."""
         steps = 86_400.0 / self.recording.interval.total_seconds()
-        result: Array = steps * np.mean(self.point(name).rates, axis=0)
+        result: Array = steps * np.array(self.point(name).packets)
         return result
 
 
@@ -233,7 +233,8 @@ def write_report(report: FieldReport, folder: Path) -> str:
     target = "the tolerance" if study.tolerance else f"{study.rate:g} packets a sensor and step"
     summary = [
         f"## At {target}",
-        f"{windows} windows of {study.horizon} steps, which were not fitted.",
+        f"Settings, packets and errors of a sensor are those of {study.lengths[1]:,} steps in one "
+        f"piece, which were not fitted; curves are means of {windows} windows.",
         *(_tolerance_lines(report) if study.tolerance else _rate_lines(report)),
         device_table(report),
         *([] if report.device is None else [f"{report.device}: {DEVICES[report.device][2]}"]),
@@ -292,14 +293,24 @@ def _tolerance_lines(report: FieldReport) -> list[str]:
     listed = ", ".join(f"{c.name} {value:g} {c.unit}".strip() for c, value in pairs)
     for name in report.points:
         excess = study.excess(report.point(name).deviations)
-        packets = f"{report.packets_a_day(name).sum():.1f}"
-        rows.append((name, packets if excess <= 1.0 else "not reached", f"{excess:.2f}"))
-    answer = "No other method without a downlink keeps the tolerance with fewer packets."
-    if study.order(report.point(report.best))[0] > 1.0:
+        fitted, packets = report.point(name).order[0], f"{report.packets_a_day(name).sum():.1f}"
+        packets = packets if fitted <= 1.0 else "not reached"
+        rows.append((name, packets, f"{fitted:.2f}", f"{excess:.2f}"))
+    best = report.point(report.best)
+    answer = "No other method without a downlink keeps the tolerance there with fewer packets."
+    if best.order[0] > 1.0:
         answer = "**No setting keeps the tolerance**; the errors below are the least."
+    elif study.excess(best.deviations) > 1.0:
+        answer += (
+            " **On the other part it exceeds the tolerance**, because that part differs. Give a "
+            "smaller one, or a longer log."
+        )
     return [
-        f"Root mean square errors that are allowed: {listed}. Packets are those of all sensors.",
-        table(("method", "packets a day", "largest error over its tolerance"), rows),
+        f"Root mean square errors that are allowed: {listed}. The fitted part selects the "
+        "settings. Packets are those of all sensors on the other part.",
+        table(
+            ("method", "packets a day", "error over its tolerance, fitted part", "other part"), rows
+        ),
         "## Recommendation",
         f"{MEANINGS[report.best]} {answer}",
     ]

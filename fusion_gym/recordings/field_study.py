@@ -1,13 +1,15 @@
 """Rules tuned on a fitted plant and measured on the held-out part of its log.
 
 The target is a rate, at which errors are compared, or a tolerance, which the least packets keep.
+The fitted part selects what keeps it. At the target, the held-out part is replayed in one piece.
+Elsewhere, windows begin with steps that do not count, because their first state is known.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from joblib import Memory
@@ -20,9 +22,12 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import run_episodes, seeded
 from fusion_gym.evaluation.metrics import LEVEL, RESAMPLES, Interval
+from fusion_gym.policies.base import decide, owner_of
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.recordings.environment import WindowNoise
+from fusion_gym.validation import LONGEST_HORIZON
 
 ENV = "fusion_gym/RecordedFusion-v1"
 FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the target rate, or of 1 / tolerance²
@@ -50,6 +55,17 @@ class Trial(NamedTuple):
     deviations: list[float]
 
 
+class Replay(NamedTuple):
+    """W windows of the log: errors (W,), packets a step (W, l) and root mean square errors (l,).
+
+    The mean of the errors is the weighted mean of the squared errors at the steps with a reading.
+    """
+
+    errors: Array
+    rates: Array
+    deviations: Array
+
+
 @dataclass(frozen=True)
 class FieldStudy:
     """A log with its plant, and the target of the rules.
@@ -62,6 +78,7 @@ class FieldStudy:
         source: source of the process noise of tuning and training.
         tolerance: largest root mean square error of each channel, in its unit; empty for the rate.
         steps: step and largest value of each sensor's threshold; empty for any value.
+        lengths: steps of the fitted and of the held-out part.
         longest: most steps between two reports that a device holds.
         trials: folder of finished simulations; None for none.
     """
@@ -73,6 +90,7 @@ class FieldStudy:
     source: str
     tolerance: tuple[float, ...] = ()
     steps: tuple[tuple[float, float], ...] = ()
+    lengths: tuple[int, int] = (0, 0)
     longest: float = math.inf
     trials: Path | None = None
 
@@ -91,9 +109,9 @@ class FieldStudy:
             return self.excess(trial.deviations) <= factor**-0.5
         return trial.rate > factor * self.rate
 
-    def order(self, point: "MethodPoint") -> tuple[float, float]:
-        """Return what decides between points: to keep the tolerance, then few packets."""
-        return max(self.excess(point.deviations), 1.0), float(np.mean(point.rates))
+    def order(self, trial: Trial) -> tuple[float, float]:
+        """Return what decides between trials: to keep the tolerance, then few packets."""
+        return max(self.excess(trial.deviations), 1.0), trial.rate
 
     def quantize(self, sizes: Array) -> Array:
         """Return sizes as a device holds them, in its steps or else with four digits."""
@@ -105,6 +123,31 @@ class FieldStudy:
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return a function's result, which an interrupted study keeps."""
         return Memory(self.trials, verbose=0).cache(function)(self, *arguments)
+
+    def replay(
+        self, source: str, filter_name: str, options: Mapping[str, Any], rule: str,
+        whole: bool = False,
+    ) -> Replay:  # fmt: skip
+        """Return a rule's results on a part of the log, in windows or as a whole."""
+        length, first = self.lengths[source == "recorded"], 0
+        if whole:
+            horizon = (length - 1) // math.ceil((length - 1) / LONGEST_HORIZON) - 1
+        else:
+            first = min(self.max_interval, length // 4)
+            horizon = min(first + max(self.horizon, first), length - 2)
+        task = self.task(filter_name, source, **{**options, "horizon": horizon})
+        policy, noise = make_policy(rule, task), cast(WindowNoise, task.noise)
+        batch = seeded(task, owner_of(policy), np.arange(noise.count))
+        sums = np.zeros((3, noise.count, len(self.shape)))
+        for step, requests in enumerate(decide(policy, batch, 0)):
+            outcome, known = batch.step(requests), cast(Any, batch.delivered.known)
+            if step >= first:
+                sums += [part[: len(self.shape)].T
+                         for part in (outcome.squared_error, known, outcome.granted)]  # fmt: skip
+        squared, readings, packets = sums
+        weights = np.array(self.options["state_weights"])[: len(self.shape)]
+        squared = squared / readings.mean(0)
+        return Replay(squared @ weights, packets / (horizon - first), np.sqrt(squared.mean(0)))
 
     def task(self, filter_name: str, source: str, **options: Any) -> Task:
         """Return the task of a filter, in which a packet costs one token."""
@@ -122,14 +165,18 @@ class MethodPoint:
         simulated_error: error in the simulation that tuned it.
         errors: error of each window (W,), relative to the channels' variance.
         rates: packets a step of each window and sensor (W, sensors).
-        deviations: root mean square error of each channel, in its unit.
+        order: excess over the tolerance and packets on the fitted part; empty for a rate.
+        packets: packets a step of each sensor on the whole held-out part, at the target alone.
+        deviations: root mean square error of each channel there, in its unit.
     """
 
     thresholds: list[float]
     simulated_error: float
     errors: list[float]
     rates: list[list[float]]
-    deviations: list[float]
+    order: list[float]
+    packets: list[float] = field(default_factory=list)
+    deviations: list[float] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -175,12 +222,32 @@ def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
         best = minimize(objective, first, method="Powell", bounds=bounds, options=limits)
         middle = np.exp(start + best.x)
     sizes = [scale(study, name, middle, factor, _NEAR) for factor in FACTORS]
-    if study.tolerance:  # which the held-out part must keep
-        sizes[len(sizes) // 2] = scale(study, name, middle, 1.0, _FAR, "recorded")
-    return [
-        study.call(point_at, own.tolist(), METHODS[name][0], *rule_of(study, name, own))
-        for own in map(study.quantize, sizes)
-    ]
+    if study.tolerance:
+        shapes = [middle, shape] if METHODS[name][1] else [middle]
+        each = [scale(study, name, own, 1.0, _FAR, "fitted") for own in shapes]
+        trials = [study.call(run_trial, name, own, "fitted") for own in each]
+        orders = [study.order(trial) for trial in trials]
+        sizes[len(sizes) // 2] = each[orders.index(min(orders))]
+    rules = [(own.tolist(), METHODS[name][0], *rule_of(study, name, own))
+             for own in map(study.quantize, sizes)]  # fmt: skip
+    return measured(study, rules, len(rules) // 2)
+
+
+def measured(
+    study: FieldStudy, rules: Sequence[tuple[Any, ...]], target: int | None = None
+) -> list[MethodPoint]:
+    """Return the points of rules, as arguments of ``point_at``, one as a whole.
+
+    Without a target it is the point that keeps the tolerance on the fitted part.
+    """
+    points = [study.call(point_at, *own) for own in rules]
+    if target is None:
+        target = min(range(len(points)), key=lambda place: points[place].order)
+    replay = study.call(replay_whole, *rules[target][1:])
+    points[target] = replace(
+        points[target], packets=replay.rates.mean(0).tolist(), deviations=replay.deviations.tolist()
+    )
+    return points
 
 
 def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[Options, str]:
@@ -198,46 +265,39 @@ def rule_of(study: FieldStudy, name: str, sizes: Array) -> tuple[Options, str]:
 def point_at(
     study: FieldStudy, sizes: list[float], filter_name: str, options: Mapping[str, Any], rule: str
 ) -> MethodPoint:
-    """Return a rule's results in simulation and on all windows of the held-out part."""
-    runs = []
-    for source in (study.source, "recorded"):
-        task = study.task(filter_name, source, **options)
-        count = getattr(task.noise, "count", 4 * _EPISODES)
-        runs.append(run_episodes(task, make_policy(rule, task), count, 0))
-    return point_of(study, sizes, *runs)
+    """Return a rule's results in simulation and on windows of the held-out part."""
+    task = study.task(filter_name, study.source, **options)
+    simulated = run_episodes(task, make_policy(rule, task), 4 * _EPISODES, 0)
+    windows = study.replay("recorded", filter_name, options, rule)
+    order = list[float]()
+    if study.tolerance:
+        order += study.order(_trial(study.replay("fitted", filter_name, options, rule)))
+    error = float(simulated.error_cost.mean())
+    return MethodPoint(sizes, error, windows.errors.tolist(), windows.rates.tolist(), order)
 
 
-def point_of(
-    study: FieldStudy, sizes: list[float], simulated: EpisodeResults, real: EpisodeResults
-) -> MethodPoint:
-    """Return a point from the results in simulation and on the windows.
-
-    Errors on the windows are divided by the share of readings, because others count as zero.
-    """
-    squared = _squared(study, study.task("joint", "recorded"), real)
-    weights = np.array(study.options["state_weights"])[: len(study.shape)]
-    scale = float(weights @ squared) / max(float(real.error_cost.mean()), 1e-300)
-    errors, deviations = (scale * real.error_cost).tolist(), np.sqrt(squared).tolist()
-    simulated_error = float(simulated.error_cost.mean())
-    return MethodPoint(sizes, simulated_error, errors, real.rate.tolist(), deviations)
+def replay_whole(
+    study: FieldStudy, filter_name: str, options: Mapping[str, Any], rule: str
+) -> Replay:
+    """Return a rule's results on the whole held-out part."""
+    return study.replay("recorded", filter_name, options, rule, whole=True)
 
 
-def _squared(study: FieldStudy, task: Task, results: EpisodeResults) -> Array:
-    """Return each channel's mean squared error (sensors,) at the steps with a reading."""
-    readings = getattr(task.noise, "readings", np.ones((1, len(study.shape)))).mean(0)
-    squared: Array = results.squared_error.mean(0)[: len(study.shape)] / readings
-    return squared
+def _trial(replay: Replay) -> Trial:
+    error, rate = float(replay.errors.mean()), float(replay.rates.mean())
+    return Trial(error, rate, replay.deviations.tolist())
 
 
 def run_trial(study: FieldStudy, name: str, sizes: Array, source: str) -> Trial:
-    """Return the results on the tuning episodes, or on all windows of the held-out part."""
-    options, rule = rule_of(study, name, sizes)
-    task = study.task(METHODS[name][0], source, **options)
-    count = getattr(task.noise, "count", _EPISODES)
-    seed = 0 if source == "recorded" else seeds.FIELD.start
-    results = run_episodes(task, make_policy(rule, task), count, seed)
-    deviations = np.sqrt(_squared(study, task, results)).tolist()
-    return Trial(float(results.error_cost.mean()), float(results.rate.mean()), deviations)
+    """Return the results on the tuning episodes, or on windows of a part of the log."""
+    filter_name, (options, rule) = METHODS[name][0], rule_of(study, name, sizes)
+    if source in ("fitted", "recorded"):
+        return _trial(study.replay(source, filter_name, options, rule))
+    task = study.task(filter_name, source, **options)
+    results = run_episodes(task, make_policy(rule, task), _EPISODES, seeds.FIELD.start)
+    squared = results.squared_error.mean(0)[: len(study.shape)]
+    error, rate = float(results.error_cost.mean()), float(results.rate.mean())
+    return Trial(error, rate, np.sqrt(squared).tolist())
 
 
 def scale(

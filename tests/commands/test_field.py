@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,18 +11,19 @@ import yaml
 from command_runs import call, refusal, succeed
 
 import fusion_gym
+from fusion_gym import Reception
 from fusion_gym.commands import field
-from fusion_gym.evaluation import run_episodes
 from fusion_gym.recordings import Recording, field_study, fit
-from fusion_gym.recordings.environment import WindowNoise
 from fusion_gym.recordings.field_report import fields_of, longest_interval, step_of
 from fusion_gym.recordings.field_study import (
+    METHODS,
     PRACTICE,
     FieldStudy,
     MethodPoint,
     compare_with_practice,
     measure,
-    point_of,
+    replay_whole,
+    rule_of,
 )
 from fusion_gym.validation import ConfigurationError
 
@@ -35,7 +35,7 @@ def point(factor: float, error: float, spread: float = 0.0, windows: int = 40) -
     draw = np.random.default_rng(0).normal(size=windows)
     draw = spread * (draw - draw.mean())
     rates = [[0.05 * factor] * 2] * windows
-    return MethodPoint([1.0], error, (error * (1.0 + draw)).tolist(), rates, [1.0, 1.0])
+    return MethodPoint([1.0], error, (error * (1.0 + draw)).tolist(), rates, [])
 
 
 def test_methods_are_compared_at_equal_packets_and_at_equal_error() -> None:
@@ -63,8 +63,8 @@ def test_the_interval_is_that_of_blocks_of_five_windows(level: float) -> None:
     errors = (1.0 + 0.1 * (level * blocks + (1.0 - level) * turns)).tolist()
     rates = [[0.05, 0.05]] * 80
     points = {
-        PRACTICE: [MethodPoint([1.0], 1.0, [1.0] * 80, rates, [1.0, 1.0])],
-        "centralised": [MethodPoint([1.0], 1.0, errors, rates, [1.0, 1.0])],
+        PRACTICE: [MethodPoint([1.0], 1.0, [1.0] * 80, rates, [])],
+        "centralised": [MethodPoint([1.0], 1.0, errors, rates, [])],
     }
     points = {name: own * 2 for name, own in points.items()}
     relative = compare_with_practice(STUDY, points)[1].relative
@@ -74,23 +74,82 @@ def test_the_interval_is_that_of_blocks_of_five_windows(level: float) -> None:
     assert relative.mean - relative.low == pytest.approx(expected, rel=0.1, abs=1e-12)
 
 
-def test_errors_are_means_of_the_steps_with_readings() -> None:
-    """Half the readings of the second sensor are absent, and their errors count as zero."""
-    known = np.zeros((8, 2))
-    known[::2, 1] = np.nan
-    rows = np.hstack([np.zeros((8, 2)), known])
-    noise = WindowNoise(np.zeros((2, 7)), rows, np.array([0, 4]), 2)
-    study: Any = SimpleNamespace(
-        task=lambda *names: SimpleNamespace(noise=noise),
-        shape=(1.0, 1.0), options={"state_weights": [0.5, 0.125, 0.0]},
+def drawn_log(file: Path, seed: int, rows: int = 1500) -> str:
+    """Three channels of one walk each, of two decimals, with 3 % of the readings missing."""
+    draw = np.random.default_rng(seed)
+    path = np.cumsum(draw.normal(size=(rows, 3)), axis=0) * [0.2, 1.0, 0.05]
+    path = np.round(path - 0.01 * np.cumsum(path, axis=0) * [1, 1, 1], 2)
+    path[draw.random(path.shape) < 0.03] = np.nan
+    index = pd.date_range("2026-01-01", periods=rows, freq="10min", name="time")
+    pd.DataFrame(path, index, list("abc")).to_csv(file)
+    return str(file)
+
+
+def sent_on_change(readings: Any, thresholds: Any, most: int) -> tuple[Any, Any]:
+    """Which readings (T, l) after the first, known ones devices send, and the last sent ones."""
+    last, age, sent, lasts = readings[0].copy(), np.zeros(readings.shape[1]), [], []
+    for row in readings[1:]:
+        age += 1
+        change = np.abs(row - last)
+        sends = (change > 0.0) & (change >= thresholds * (1 - 1e-6)) | (age >= most)
+        sends &= np.isfinite(row)
+        last, age = np.where(sends, row, last), np.where(sends, 0, age)
+        sent.append(sends)
+        lasts.append(last)
+    return np.array(sent), np.array(lasts)
+
+
+def errors_of_stream(task: Any, sent: Any) -> Any:
+    """Errors (T, l) of a centre that predicts, observes and updates; NaN without a reading."""
+    centre, noise, plant, errors = task.estimator, task.noise, task.plant, []
+    known, day = plant.start(noise.start(0, 0, plant.start_channels)[:, None])
+    state = centre.start(plant.measurement(known), day)
+    for step, sends in enumerate(sent):
+        row = noise.steps(0, 0, step, 1, plant.noise_channels)[0][:, None]
+        known = plant.sense(known, row)
+        reading = plant.measurement(known)
+        packets = np.where(sends[:, None, None], reading, np.nan)
+        state = centre.observe(centre.predict(state), packets)
+        possible = np.isfinite(reading[:, 0])
+        state = centre.update(state, Reception(sends[:, None], possible))
+        errors.append(np.where(possible, known.truth - state.mean, np.nan)[:, 0])
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("log", ["tanks", "mast", 0, 1, 2])
+@pytest.mark.parametrize("method", [PRACTICE, "silence ignored, one a sensor", "silence used"])
+def test_what_is_reported_is_one_replay_of_the_other_part(
+    log: Any, method: str, tmp_path: Path
+) -> None:
+    source = log if isinstance(log, str) else drawn_log(tmp_path / "log.csv", log)
+    recording = Recording.read(source).select()
+    if log in ("tanks", "mast"):
+        replace(recording, values=recording.values[:2400]).write(tmp_path / "log.csv")
+        source = str(tmp_path / "log.csv")
+        recording = Recording.read(source).select()
+    plant = fit(recording, exact=True, order=1)
+    rows = len(recording.values) // 2
+    study = FieldStudy(
+        plant.options | {"log": source}, 0.05, plant.typical_changes, 50, "normal",
+        lengths=(rows, len(recording.values) - rows),
     )  # fmt: skip
-    squared = np.array([[1.0, 2.0, 7.0], [3.0, 6.0, 7.0]])  # of two windows
-    cost = squared @ study.options["state_weights"]
-    real: Any = SimpleNamespace(squared_error=squared, error_cost=cost, rate=np.zeros((2, 2)))
-    result = point_of(study, [1.0], SimpleNamespace(error_cost=np.ones(3)), real)  # type: ignore[arg-type]
-    assert result.deviations == pytest.approx(np.sqrt([2.0, 4.0 / 0.5]))
-    assert np.mean(result.errors) == pytest.approx(0.5 * 2.0 + 0.125 * 4.0 / 0.5)
-    assert result.errors[1] == pytest.approx(3.0 * result.errors[0])
+    thresholds = study.quantize(3.0 * np.array(plant.typical_changes))
+    filter_name, (options, rule) = METHODS[method][0], rule_of(study, method, thresholds)
+    result = replay_whole(study, filter_name, options, rule)
+    first = recording.values.interpolate(limit_direction="both").iloc[rows : rows + 1]
+    readings = pd.concat([first, recording.values.iloc[rows + 1 : -1]]).to_numpy()
+    sent, last = sent_on_change(readings, thresholds, study.max_interval)
+    if filter_name == "hold":
+        squares = (readings[1:] - last) ** 2
+    else:
+        task = study.task(filter_name, "recorded", **options, horizon=len(sent))
+        squares = errors_of_stream(task, sent) ** 2
+    errors = np.sqrt(np.nanmean(squares, axis=0))
+    assert len(result.rates) == 1
+    np.testing.assert_allclose(result.rates[0], sent.mean(0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(result.deviations, errors, rtol=1e-6)
+    weights = np.array(plant.options["state_weights"])
+    assert result.errors[0] == pytest.approx(weights @ errors**2, rel=1e-6)
 
 
 ROOM = ["--exact", "--share", "0.6", "--workers", "1", "--timesteps", "10"]
@@ -117,7 +176,7 @@ def write_room(file: Path, noise: float = 0.0, rows: int = 2400) -> None:
 def test_the_least_packets_keep_the_tolerance_with_what_a_device_holds(
     room: list[str], tmp_path: Path
 ) -> None:
-    """The written settings, replayed by themselves; thresholds a third larger exceed it."""
+    """On the fitted part; thresholds a third larger exceed it. The other part is replayed."""
     words = [*room, "--tolerance", "air=0.3", "damp=1.5", "--device", "zigbee"]
     printed = succeed("field", words).out
     settings = yaml.safe_load((tmp_path / "field" / "devices.yaml").read_text())
@@ -132,21 +191,20 @@ def test_the_least_packets_keep_the_tolerance_with_what_a_device_holds(
     thresholds = np.array([row["reportable_change"] for row in settings.values()])
     code = printed.split("make_task(")[1].split(")")[0]
     plant = yaml.safe_load((tmp_path / "field" / "plant.yaml").read_text())
-    options = {"log": room[0], "tokens": "unlimited", "fit_share": 0.6, "horizon": 20} | plant
-    steps, excess = max(intervals) // 600, []
+    options = {"log": room[0], "fit_share": 0.6} | plant
+    tolerance, steps = (0.3, 1.5), max(intervals) // 600
+    study = FieldStudy(options, 10.0 / steps, (1.0, 1.0), 20, "normal", tolerance,
+                       lengths=(1440, 960))  # fmt: skip
+    method = "silence used" if "truncated" in code else PRACTICE
+    excess = []
     for factor in (1.0, 1.35):
-        own = (factor * thresholds).tolist()
-        silence = {"filter": "truncated", "trigger": "report_on_change", "trigger_threshold": own}
-        silence = silence if "truncated" in code else {"filter": "hold"}
-        task = fusion_gym.make_task(field_study.ENV, **options | silence)
-        rule = f"report_on_change:reportable_change={own[0]}/{own[1]},max_interval={steps}"
-        noise: Any = task.noise
-        results = run_episodes(task, fusion_gym.make_policy(rule, task), noise.count, 0)
-        excess.append(np.max(np.sqrt(results.squared_error.mean(0)) / [0.3, 1.5]))
-        day = results.rate.mean(0) * 144
-        if factor == 1.0:
-            assert all(f"| {value:.1f} " in printed for value in day)
+        own = rule_of(study, method, factor * thresholds)
+        excess.append(study.excess(study.replay("fitted", METHODS[method][0], *own).deviations))
     assert excess[0] <= 1.0 < excess[1]
+    whole = replay_whole(study, METHODS[method][0], *rule_of(study, method, thresholds))
+    assert all(f"| {value:.1f} " in printed for value in whole.rates[0] * 144)
+    assert all(f"| {value:.3g} " in printed for value in whole.deviations)
+    assert ("**On the other part it exceeds" in printed) == (study.excess(whole.deviations) > 1.0)
 
 
 @pytest.mark.slow
