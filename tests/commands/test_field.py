@@ -10,7 +10,6 @@ import pytest
 import yaml
 from command_runs import call, refusal, succeed
 
-import fusion_gym
 from fusion_gym import Reception
 from fusion_gym.commands import field
 from fusion_gym.recordings import Recording, field_study, fit
