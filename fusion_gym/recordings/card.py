@@ -184,14 +184,21 @@ def _reported_change(values: Array) -> float:
 
 
 def _copies(values: pd.DataFrame) -> dict[str, str]:
-    """Return the channels whose changes earlier channels determine, each with its fault."""
+    """Return the channels that earlier channels determine, each with its fault."""
+    resolutions = {name: np.diff(np.unique(values[name].dropna())).min(initial=np.inf)
+                   for name in values}  # fmt: skip
     changes = values.diff()
     changes /= changes.std().where(lambda size: size > 0.0, 1.0)
     equal = changes.corr(min_periods=20).abs() > 1.0 - 1e-6
     result: dict[str, str] = {}
     for name in changes:
         earlier = [other for other in changes.loc[:, :name].columns[:-1] if other not in result]
-        same = [other for other in earlier if equal.loc[other, name]]
+        same = [
+            other
+            for other in earlier
+            if equal.loc[other, name]
+            or _is_rounded(values[other], values[name], resolutions[other], resolutions[name])
+        ]
         complete = changes[[*earlier, name]].dropna().to_numpy()
         if same:
             result[name] = f"repeats {same[0]}"
@@ -202,3 +209,14 @@ def _copies(values: pd.DataFrame) -> dict[str, str]:
                 used = [o for o, f in zip(earlier, factors, strict=True) if abs(f) > 0.01]
                 result[name] = f"a sum of {', '.join(used)}"
     return result
+
+
+def _is_rounded(one: pd.Series, other: pd.Series, resolution: float, own: float) -> bool:
+    """Return whether a line through one column gives the other up to their resolutions."""
+    known = one.notna() & other.notna()
+    x, y = one[known].to_numpy(), other[known].to_numpy()
+    if len(x) < 20 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return False
+    slope, level = np.polyfit(x, y, 1)
+    limit = 0.5 * own + 0.5 * abs(slope) * resolution
+    return bool(np.abs(y - level - slope * x).max() <= 1.05 * limit < 0.2 * y.std())

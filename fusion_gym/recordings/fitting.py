@@ -231,6 +231,8 @@ def fit(
     for place, (name, readings) in enumerate(recording.values[:rows].items()):
         known = np.isfinite(values[:rows, place])
         integer(f"readings of {name} in the fitted part", int(known.sum()), at_least=least)
+        if not np.isfinite(values[rows:, place]).any():
+            raise refusal("channels", name, "channels with readings after the fitted part, too")
         scale[place] = values[:rows][known, place].std()
         if scale[place] <= _CONSTANT * readings.abs().max():
             raise refusal("channels", name, "channels that change in the fitted part")
@@ -244,7 +246,7 @@ def fit(
     try:
         if len(whole) > len(scale) > np.linalg.matrix_rank(whole, tol=_DEPENDENT * len(whole)):
             raise np.linalg.LinAlgError
-        for lags in _ORDERS if order is None else ():
+        for lags in _orders(train) if order is None else ():
             plant = _fit(recording, train, lags, exact, floor)
             errors[lags] = criticise(plant, validation, (_TARGET,))[0].real
         good = _CLOSE * float(np.nanmin([*errors.values(), np.inf]))
@@ -355,19 +357,29 @@ def _is_complete(values: Array) -> bool:
     return float((complete[1:] & complete[:-1]).mean()) > 0.5
 
 
+def _regression(values: Array, order: int) -> tuple[Array, Array]:
+    """Return the complete deviations (T, channels), each with those before (T, n)."""
+    lags = [values[order - lag : len(values) - lag] for lag in range(order + 1)]
+    complete = np.isfinite(np.hstack(lags)).all(axis=1)
+    return lags[0][complete], np.hstack(lags[1:])[complete]
+
+
+def _orders(values: Array) -> list[int]:
+    """Return the orders for which these deviations suffice, at least the first."""
+    least = _LEAST * values.shape[1]
+    return [n for n in _ORDERS if n == 1 or len(_regression(values, n)[0]) >= least * n]
+
+
 def _fit(recording: Recording, values: Array, order: int, exact: bool, noise: Array) -> FittedPlant:
     """Return the plant of scaled deviations, with at least the variances ``noise`` (channels,)."""
     count, remarks = values.shape[1], []
     if exact and _is_complete(values):
-        lags = np.hstack([values[order - lag : len(values) - lag] for lag in range(1, order + 1)])
-        now = values[order:]
-        complete = np.isfinite(np.hstack([now, lags])).all(axis=1)
-        if complete.sum() < _LEAST * count * order:
+        now, lags = _regression(values, order)
+        if len(now) < _LEAST * count * order:
             raise ConfigurationError(
-                f"recording is not allowed with order {order}: {complete.sum()} steps have all "
+                f"recording is not allowed with order {order}: {len(now)} steps have all "
                 f"readings with those before, and {_LEAST * count * order} must"
             )
-        now, lags = now[complete], lags[complete]
         coefficients = (np.linalg.pinv(lags) @ now).T
         residuals = now - lags @ coefficients.T
         process = residuals.T @ residuals / (len(now) - np.linalg.matrix_rank(lags))
@@ -390,7 +402,7 @@ def _fit(recording: Recording, values: Array, order: int, exact: bool, noise: Ar
 
 def _fullest(values: Array) -> Array:
     """Return the neighbouring steps with the most readings of the channel that has the fewest."""
-    most = min(_ROWS, len(values))
+    most = min(max(_ROWS, _LEAST * (1 + values.shape[1])), len(values))
     fewest = pd.DataFrame(np.isfinite(values)).rolling(most).sum().min(axis=1)
     last = len(values) - int(np.argmax(fewest.fillna(-1.0)[::-1]))
     return values[last - most : last]

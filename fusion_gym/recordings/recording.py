@@ -133,8 +133,8 @@ class Recording:
 
         Args:
             names: names of channels.
-            share: share of the rows, from the first, for a fit: a channel that is constant there
-                has a fault.
+            share: share of the rows, from the first, for a fit: a channel that is constant there,
+                or has no reading after it, has a fault.
 
         Raises:
             ConfigurationError: a name is unknown, or every channel has a fault.
@@ -146,8 +146,11 @@ class Recording:
         card = self.card
         low, high = ([getattr(row.channel, end) for row in card] for end in ("low", "high"))
         values = self.values.where((self.values > low) & (self.values < high))
-        different = values.iloc[: int(share * len(values))].nunique()
+        rows = int(share * len(values))
+        different, after = values.iloc[:rows].nunique(), values.iloc[rows:].count()
         late = {name: "constant in the fitted part" for name in known if different[name] < 2}
+        if rows < len(values):
+            late |= {name: "no reading after the fitted part" for name in known if not after[name]}
         faults = {row.channel.name: row.fault or late.get(row.channel.name, "") for row in card}
         chosen = [name for name in known if (name in names if names else not faults[name])]
         if not chosen:

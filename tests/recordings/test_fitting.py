@@ -294,3 +294,39 @@ def test_the_option_file_is_a_plant_of_the_environment_and_the_packaged_one(tmp_
     assert packaged.noise is not None
     error = refusal("fit", ["tanks", "--channels", "lake"])
     assert "channels = 'lake' is not allowed: it must be some of inflow, middle" in error
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_sensor_that_stops_is_left_out_or_refused(exact: bool) -> None:
+    path = simulate(2400)
+    path[900:, 1] = np.nan
+    whole = recording(path)
+    own = whole.select(share=0.5)
+    assert [channel.name for channel in own.channels] == ["c0", "c2"]
+    assert "c1: no reading after the fitted part, left out" in own.remarks
+    fit(own, exact=exact)
+    named = whole.select(["c0", "c1"])
+    refused(lambda: fit(named, exact=exact), "channels = 'c1'", "after the fitted part")
+
+
+def test_an_order_without_enough_rows_is_not_tried() -> None:
+    """On two thirds of 600 rows, an order of 2 needs 600."""
+    draw = np.random.default_rng(0).normal(size=(1200, 6))
+    path = np.zeros((1200, 6))
+    for row in range(1, 1200):
+        path[row] = 0.9 * path[row - 1] + draw[row]
+    assert fit(recording(path), exact=True).order == 1
+
+
+def test_many_channels_have_as_many_rows_as_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fusion_gym.recordings.fitting._ROWS", 150)
+    monkeypatch.setattr("fusion_gym.recordings.fitting._ITERATIONS", 2)
+    assert fit(recording(simulate(600)), exact=False).order == 1
+
+
+@pytest.mark.parametrize("slope", [1.8, -0.1])
+def test_a_channel_in_another_unit_repeats_the_first(slope: float) -> None:
+    """Rounded to whole degrees; another walk of the same size does not repeat it."""
+    first, other = np.round(20.0 + 5.0 * simulate(900)[:, :2], 1).T
+    path = np.column_stack([first, np.round(32.0 + slope * first, 0 if slope > 1.0 else 1), other])
+    assert [row.fault for row in recording(path).card] == ["", "repeats c0", ""]

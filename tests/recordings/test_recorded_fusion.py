@@ -264,7 +264,7 @@ def test_what_is_no_recording_of_the_plant_is_refused(log: str) -> None:
         ({"state_names": ["a", "z"]}, "state_names = .* channels of a, b"),
         ({"measurement_matrices": [[0.0, 1.0], [1.0, 0.0]]}, "rows of the identity"),
         ({"process_covariance": [[1.0, 1.0], [1.0, 1.0]]}, "process noise of its own"),
-        ({"horizon": 2000}, "1,500 steps of the log were not fitted"),
+        ({"horizon": 2000}, "this part of the log has 1,500 steps"),
         ({"true_process_noise": 2.0}, "the truth is the recording"),
         ({"fit_share": 1.0}, "fit_share = 1.0"),
         ({"log": 3}, "^log = 3 is not allowed"),
