@@ -24,6 +24,12 @@ _PHASE = 1e-3  # of an interval: a channel that reads later than the first by mo
 _FIRST, _LAST = 1678, 2261  # years that nanoseconds reach
 _SAMPLE = 200  # lines or rows that show the layout of a file
 _ROUND = 3600.0, 60.0, 10.0, 1.0, 0.1, 0.01, 1e-3, 1e-6, 1e-9  # seconds of round intervals
+_FOOTER = 10  # lines under the rows, at most
+_BINARIES = {
+    b"PK\x03\x04": "a workbook or an archive: save the sheet as CSV",
+    b"\xd0\xcf\x11\xe0": "a workbook: save the sheet as CSV",
+    b"PAR1": "Parquet: write it by pandas.read_parquet(path).to_csv(file)",
+}
 _SHARE, _COUNT = 0.05, 3  # most readings and least count of an error code beside the known ones
 _CODES = {-127.0, 85.0, 32767.0, -32768.0, 65535.0, 6553.5, 3276.7, -3276.8, 327.67, -327.68}
 
@@ -36,12 +42,19 @@ _CLOCK_HEAD = re.compile("time|date|unix|epoch|stamp", re.IGNORECASE)
 _DATE = r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})"
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?(?:\s*[AaPp]\.?[Mm]\.?)?"
 _ORDERS = {"year first": (0, 1, 2), "day first": (2, 1, 0), "month first": (2, 0, 1)}
+_COMPACT = r"((?:19|20)\d\d)(0[1-9]|1[0-2])(0[1-9]|[12]\d|3[01])"
+_COMPACT_CLOCK = r"([01]\d|2[0-4])([0-5]\d)?([0-5]\d)?"
+_HOUR_HEAD = re.compile(r"(hr_?mn|hhmm|hours?|hrs?|h|stunde|uhrzeit|time)\b.*", re.IGNORECASE)
+_WEEKDAY = r"^(?:MON|TUE|WED|THU|FRI|SAT|SUN)[A-Z]*[.,]?\s+"
+_MONTH = r"(?i)\b(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)"
 _TWELVE = "%Y-%m-%d %I:%M:%S %p", "%Y-%m-%d %I:%M %p"
+_IDS = "sensor|channel|device|node|station|id"  # whose numbers are names, too
 _NAMES = re.compile(
-    "entity_id|_field|name|(sensor|channel|device|variable|parameter|metric|tag|topic|series|"
-    "signal|quantity|point)([ _]?(id|name))?",
+    rf"entity_id|_field|name|({_IDS}|variable|parameter|metric|tag|topic|series|signal|quantity|point|"
+    "room|location|place|zone|site|host|mac|address|model)([ _]?(id|name|type))?",
     re.IGNORECASE,
 )
+_FACTORS = {"k": 1e3, "M": 1e6, "G": 1e9}
 _VALUES = re.compile("_?value|state|reading|measurement", re.IGNORECASE)
 _CELL = r"([+-]?[\d., ]*\d\.?(?:[eE][+-]?\d+)?)\s*([^\d\s.,+'-]\D{0,9}\d?)?"
 _SPREAD = 3.0  # ratio of the relative deviations of two ways to read a column's numbers
@@ -54,18 +67,24 @@ def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
             raise ValueError("it is no regular file")
         with get_handle(path, "rb", compression="infer", is_text=False) as handle:
             raw = handle.handle.read(LONGEST_TEXT + 1)
+        for start, reason in _BINARIES.items():
+            if raw.startswith(start):
+                raise ValueError(reason)
         try:
-            text = raw.decode("utf-8-sig")
+            utf_16 = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
+            text = raw.decode("utf-16" if utf_16 else "utf-8-sig")
         except UnicodeDecodeError:
             text = raw.decode("cp1252")
-        text = re.sub(r"(?m)^#.*\n(?=\D)", "", text)
+        text = re.sub(r"(?m)^#.*\n(?=\D|\Z)", "", text)
+        text = re.sub(r"""(?i)\A"?sep=.{1,2}"?\r?\n""", "", text)
         width, separator, above = _layout(text)
+        text, below = _without_footer(text, separator, width)
         if len(raw) > LONGEST_TEXT or width > 1 + LONGEST or "\0" in text:
             most = f"above {LONGEST_TEXT:,} bytes or {LONGEST} channels, or binary"
             raise ValueError(f"{width} columns: {most}")
         cells = pd.read_csv(
-            io.StringIO(text), sep=separator, header=None, dtype=str, skiprows=above,
-            skipinitialspace=True,
+            io.StringIO(text), sep=r"\s+" if separator == " " else separator, header=None,
+            dtype=str, skiprows=above, skipinitialspace=True,
         ).apply(lambda column: column.str.strip())  # fmt: skip
         heads = cells.iloc[0].fillna("").str.lstrip("# ")
         numeric = heads.str.fullmatch(r"[\d\s.,:/TZ+-]+")
@@ -83,18 +102,38 @@ def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
         heads = heads.where(units.isin(("", "TS", "RN")), heads + " [" + units + "]")
         cells = cells.iloc[2:]
     remarks += [f"{above} lines above the heads: left out"] if above else []
+    remarks += [f"{below} lines below the rows: left out"] if below else []
     return cells.iloc[1:].set_axis(list(heads), axis=1).reset_index(drop=True)
 
 
 def _layout(text: str) -> tuple[int, str, int]:
     """Return the number of columns, the separator, and the number of lines above the heads."""
     lines, choices = text.split("\n", _SAMPLE)[:_SAMPLE], []
-    for separator in ",;\t":
-        widths = [len(row) for row in csv.reader(lines, delimiter=separator, skipinitialspace=True)]
+    for separator in ",;\t| ":
+        widths = _widths(lines, separator)
         width = max(widths, key=widths.count)
         above = 1 if text.lstrip('"').startswith("TOA5") else widths.index(width)
         choices.append((widths.count(width) * (width > 1), width, separator, above))
-    return max(choices)[1:]
+    single = max(choices[:-1])[0] == 0 and choices[-1][-1] == 0  # no head is above
+    return max(choices if single else choices[:-1])[1:]
+
+
+def _widths(lines: Sequence[str], separator: str) -> list[int]:
+    """Return the number of cells of each line."""
+    plain = [line.strip(" \r") for line in lines] if separator == " " else lines
+    rows = csv.reader(plain, delimiter=separator, skipinitialspace=True)
+    return [len(row) for row in rows]
+
+
+def _without_footer(text: str, separator: str, width: int) -> tuple[str, int]:
+    """Return the text without last lines of other widths, and their number."""
+    lines = text.rstrip().split("\n")
+    count = 0
+    while len(lines) > 1 and _widths([lines[-1]], separator) != [width]:
+        if re.match(r"\W*\d", lines.pop()) or count == _FOOTER:
+            return text, 0
+        count += 1
+    return "\n".join([*lines, ""]), count
 
 
 def split_times(
@@ -108,6 +147,13 @@ def split_times(
         [place for place, own in enumerate(samples) if len(own) and own.str.fullmatch(form).all()]
         for form in (_DATE, _CLOCK)
     )
+    if not clocks:
+        days = [place for place, own in enumerate(samples)
+                if len(own) and own.str.fullmatch(_COMPACT).all()]  # fmt: skip
+        for place in [place for place, own in enumerate(samples) if dates or days]:
+            if (clock := _clock_of(columns[place], str(table.columns[place]))) is not None:
+                columns[place], clocks, dates = clock, [place], dates or days
+                break
     if dates and clocks:
         cells, used = columns[dates[0]] + " " + columns[clocks[0]], {dates[0], clocks[0]}
     else:
@@ -122,6 +168,18 @@ def split_times(
     if table.iloc[:, list(blank)].notna().to_numpy().any():
         remarks.append("a column without a head: left out")
     return times, table.iloc[:, [n for n in range(len(columns)) if n not in used | blank]]
+
+
+def _clock_of(cells: pd.Series, head: str) -> pd.Series | None:
+    """Return hours, or hours and minutes as one number, as texts such as 07:30."""
+    if not _HOUR_HEAD.fullmatch(head) or not cells.dropna().str.fullmatch(r"\d{1,4}").all():
+        return None
+    numbers = pd.to_numeric(cells)
+    numbers = numbers * 100 if numbers.max() <= 24 else numbers
+    if numbers.max() > 2400 or (numbers % 100).max() > 59:
+        return None
+    digits = numbers.map("{:04.0f}".format, na_action="ignore")
+    return digits.str[:2] + ":" + digits.str[2:]
 
 
 def _is_numeric(cells: pd.Series) -> bool:
@@ -147,7 +205,20 @@ def _parse(
             )
     if choices and order != "year first":
         remarks.append(f"dates such as {cells.dropna().iloc[0]!r} are read {order}")
+    falls, hours = times.dropna().diff() / pd.Timedelta("1h"), times.dt.hour.dropna()
+    twelve = hours.between(1, 12).all() and hours.nunique() > 6
+    if twelve and ((falls < -9.0) & (falls > -13.0)).any() and not cells.str.contains("[Mm]").any():
+        raise ConfigurationError(
+            f"{source} is not allowed: its clock goes from 1 to 12, such as "
+            f"{cells.dropna().iloc[0]!r}, without AM or PM; export 24 hours"
+        )
     lost = int(times.isna().sum())
+    zones = cells.str.extract(r"\d\s*([A-Z]{3,5})$")[0].dropna().unique()
+    if lost > len(times) / 2 and len(zones) and date_format is None:
+        raise ConfigurationError(
+            f"{source} is not allowed: its times have the zone {zones[0]!r}; export UTC, or "
+            "offsets such as +01:00"
+        )
     if lost > len(times) / 2 or len(times) - lost < _LEAST:
         for name, value in (("date_format", date_format), ("time_unit", time_unit)):
             if value is not None:
@@ -172,11 +243,17 @@ def _times(
             return {"": pd.to_datetime(cells, format=date_format, errors="coerce", utc=True)}
         except (TypeError, ValueError) as error:
             raise refusal("date_format", date_format, f"a format of strftime ({error})") from None
+    compact = cells.str.extract(f"^{_COMPACT}[ ]?{_COMPACT_CLOCK}$".replace("[ ]?", ""))
+    if time_unit is None and compact[0].notna().mean() > 0.9:
+        clock = compact[3] + ":" + compact[4].fillna("00") + ":" + compact[5].fillna("00")
+        cells = compact[0] + "-" + compact[1] + "-" + compact[2] + " " + clock
+    cells = cells.str.replace(rf"^{_COMPACT} (?=\d\d:)", r"\1-\2-\3 ", regex=True)
     if _is_numeric(cells):
         numbers = pd.to_numeric(cells, errors="coerce")
         changes = numbers.diff().dropna()
         ordered = max((changes >= 0.0).mean(), (changes <= 0.0).mean()) > 0.75
-        unit = (time_unit or _head_unit(str(cells.name), numbers)) if ordered else None
+        unit = time_unit if ordered else None
+        unit = unit or _head_unit(str(cells.name), numbers, ordered)
         if unit is None:
             return {}
         size = numbers * pd.Timedelta(1, "D" if unit in ("d", "excel") else unit).value
@@ -185,7 +262,10 @@ def _times(
         return {"": pd.to_datetime(size, unit="ns", errors="coerce")}
     plain = cells.str.upper().str.replace(r"(?<=\d),(?=\d)", ".", regex=True)
     plain = plain.str.replace(r"\s*([AP])\.?M\.?$", r" \1M", regex=True)
-    parts = plain.str.replace(r"\s*UTC$", "Z", regex=True).str.extract(
+    plain = plain.str.replace(_WEEKDAY, "", regex=True)
+    midnight = plain.str.contains(r"[T\s]24:00(?::00)?$", na=False)
+    plain = plain.str.replace(r"([T\s])24:00(?=$|:00$)", r"\g<1>00:00", regex=True)
+    parts = plain.str.replace(r"\s*(?:UTC|GMT)$", "Z", regex=True).str.extract(
         rf"^{_DATE}(?:[T.,\s]\s*(.*))?$"
     )
     result = {}
@@ -198,20 +278,20 @@ def _times(
         for form in _TWELVE:
             times = times.fillna(pd.to_datetime(date, format=form, errors="coerce", utc=True))
         if times.notna().any():
-            result[order] = times
-    words = cells.where(cells.str.contains("[A-Za-z]{3}", na=False))
+            result[order] = times + pd.to_timedelta(midnight.astype(int), "D")
+    words = cells.where(cells.str.contains(_MONTH, na=False))
     return result or {"": pd.to_datetime(words, errors="coerce", utc=True, format="mixed")}
 
 
-def _head_unit(head: str, numbers: pd.Series) -> str | None:
-    """Return the unit of numeric times."""
+def _head_unit(head: str, numbers: pd.Series, ordered: bool) -> str | None:
+    """Return the unit of numeric times, which are ordered or count from 1970."""
     low, high = numbers.quantile((0.01, 0.99))
     for unit, factor in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
         if _CLOCK_HEAD.search(head) and 9e8 < low / factor <= high / factor < 4e9:
             return unit
-    words = re.sub(r"[^\wµμ]+|_", " ", head).strip()
-    found = (u for u, word in TIME_UNITS.items() if re.search(rf"(?i)\b(?:{word})$", words))
-    return next(found, None)
+    words = re.sub(r"[^\wµμ]+|_", " ", head).strip() if ordered else ""
+    units = (u for u, word in TIME_UNITS.items() if re.search(rf"(?i)\b(?:{word})$", words))
+    return next(units, None)
 
 
 def _evenness(times: pd.Series) -> int:
@@ -230,24 +310,47 @@ def pivoted(
     """Return the times and columns of a log with one row a reading as one row a time."""
     heads = [str(head) for head in table.columns]
     names, values = ([head for head in heads if form.fullmatch(head)] for form in (_NAMES, _VALUES))
+    words = [h for h in heads if not table[[h]].iloc[:, 0].str.match(r"[+-]?\.?\d", na=False).any()]
     if len(heads) == len(set(heads)) == 2 and times.duplicated().mean() > 0.3:
-        words = [h for h in heads if not table[h].str.match(r"[+-]?\d", na=False).any()]
-        names, values = words or names, [h for h in heads if h not in (words or names)]
-    if len(names) != 1 or len(values) != 1:
+        names = words or names
+        values = [h for h in heads if h not in names]
+    if len(set(heads)) < len(heads):
         return times, table
-    (name,), (value,) = names, values
-    long = table.assign(time=times).dropna(subset=["time", name])
-    single = long.drop_duplicates(["time", name])
-    different, twice = single[name].nunique(), len(long) - len(single)
+    long = len(values) == 1 and names
+    names = [h for h in names if long or h in words or re.match(rf"(?i){_IDS}", h)]
+    keys = [h for h in names if table[h].nunique() > 1] or (names[:1] if long else [])
+    if not keys:
+        if times.duplicated().mean() > 0.3:
+            for head in words:
+                if not table.assign(time=times).duplicated(["time", head]).any():
+                    raise ConfigurationError(
+                        f"{source} is not allowed: its rows at one time differ in {head!r}; export "
+                        "one device, or call this column 'device'"
+                    )
+        return times, table
+    constant = [h for h in heads if _NAMES.fullmatch(h) and table[h].nunique() < 2]
+    values = values if long else [h for h in heads if h not in (*names, *constant)]
+    name = table[keys[0]].str.cat([table[key] for key in keys[1:]], sep=" ")
+    rows = table.assign(time=times, name=name).dropna(subset=["time", "name"])
+    single = rows.drop_duplicates(["time", "name"])
+    different, twice = single["name"].nunique() * len(values), len(rows) - len(single)
+    key = repr(keys[0]) if len(keys) == 1 else str(keys)
     if different > LONGEST or twice > len(single) / 2:
         raise ConfigurationError(
-            f"{source} is not allowed: its column {name!r} has {different} channels and {twice} "
+            f"{source} is not allowed: its column {key} has {different} channels and {twice} "
             f"readings at the time of another; export one place with at most {LONGEST} channels"
         )
     remarks += [f"{twice} readings at the time of another: the first counts"] if twice else []
-    remarks.append(f"one row a reading: columns are the values {value!r} of each {name!r}")
-    wide = single.pivot(index="time", columns=name, values=value)[single[name].unique()]
-    wide = wide.rename_axis(columns=None).reset_index()
+    if long:
+        remarks.append(f"one row a reading: columns are the values {values[0]!r} of each {key}")
+    else:
+        remarks.append(f"several devices in one table: a column for each {key}")
+    wide = single.pivot(index="time", columns="name", values=values)
+    order = [(value, name) for value in values for name in single["name"].unique()]
+    wide = wide[order]
+    heads = [name if long else re.sub(r"(?=\s*\[)|$", f" {name}", value, count=1)
+             for value, name in order]  # fmt: skip
+    wide = wide.set_axis(heads, axis=1).reset_index()
     return wide["time"], wide.drop(columns="time")
 
 
@@ -261,13 +364,18 @@ def numbers_of(table: pd.DataFrame, source: str) -> tuple[Array, list[str]]:
     for place, name in enumerate(table.columns):
         plain = table.iloc[:, place].str.replace("[\u00a0\u202f\u2009']", " ", regex=True)
         parts = plain.str.replace("\u2212", "-").str.extract(f"^{_CELL}$")
-        own = parts[1].dropna().str.strip().unique()
+        own, factors = parts[1].dropna().str.strip().unique(), None
+        if set(own) <= set(_FACTORS) and (parts[0].notna() & parts[1].isna()).any():
+            own, factors = own[:0], parts[1].str.strip().map(_FACTORS).fillna(1.0)
         if len(own) > 1:
             raise ConfigurationError(
                 f"{source} is not allowed: its column {name!r} has units {own[:3].tolist()}"
             )
         units.append("".join(own))
-        columns.append((parts[0], {sign: _read(parts[0], sign) for sign in ".,"}))
+        read = {sign: _read(parts[0], sign) for sign in ".,"}
+        columns.append(
+            (parts[0], {s: v if factors is None else v * factors for s, v in read.items()})
+        )
         counts.append({sign: int(v.notna().sum()) for sign, v in columns[-1][1].items()})
     signs = {max(own, key=own.__getitem__) for own in counts if own["."] != own[","]}
     result = np.full(table.shape, np.nan)
@@ -348,10 +456,13 @@ def on_even_times(
 
 def _interval(differences: Array, span: float) -> float:
     """Return the interval of differences in seconds, round where that moves no step."""
-    low, middle = np.quantile(differences, (0.1, 0.5), method="lower")
-    ratio = differences / low
-    even = np.mean(np.abs(ratio - np.rint(ratio)) <= _OFF * np.sqrt(ratio)) > 0.95
-    middle = low if even and middle <= 10.0 * low else middle
+    *lows, middle = np.quantile(differences, (0.1, 0.02, 0.5), method="lower")
+    for low in lows:
+        ratio = differences / low
+        even = np.mean(np.abs(ratio - np.rint(ratio)) <= _OFF * np.sqrt(ratio)) > 0.95
+        if even and middle <= 10.0 * low:
+            middle = low
+            break
     mean = float(differences[np.abs(differences - middle) <= 0.5 * middle].mean())
     rounds = (round(mean / size) * size for size in _ROUND)
     return next((r for r in rounds if r and abs(r - mean) * span <= 0.1 * mean * mean), mean)

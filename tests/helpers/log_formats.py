@@ -140,3 +140,79 @@ def draw_log(seed: int) -> Drawn:
         text = f"{above}{top}\n{units}\n{kinds}\n{body}"
     truth = truth.dropna(how="all")
     return Drawn(text, truth, wrapped, seconds)
+
+
+@dataclass
+class Strange(Drawn):
+    """A log as bytes, and a part of its refusal where none can read it."""
+
+    content: bytes = b""
+    refusal: str | None = None
+
+
+STRANGE_CLOCKS = ("%Y-%m-%d %H:%M", "%d/%m/%Y %H:%M", "%m/%d/%Y %H:%M", "%a %d/%m/%Y %H:%M",
+                  "%d/%m/%Y %H:%M GMT", "%Y%m%d%H%M", "%d.%m.%Y %H:%M UTC", "24:00", "hours",
+                  "HrMn", "%d/%m/%Y %I:%M", "%d/%m/%Y %H:%M CET")  # fmt: skip
+ENCODINGS = "utf-8", "utf-8-sig", "cp1252", "utf-16"
+
+
+def draw_strange_log(seed: int) -> Strange:
+    """Return a log in a drawn format with weekdays, hours, footers, devices or suffixes."""
+    draw = np.random.default_rng(10_000 + seed)
+    rows, minutes = int(draw.integers(400, 1500)), int(draw.choice([30, 60]))
+    clock = str(draw.choice(STRANGE_CLOCKS))
+    minutes = 60 if clock in ("24:00", "hours", "HrMn") else minutes
+    first = pd.Timestamp("2023-01-01") + pd.Timedelta(int(draw.integers(0, 600)), "D")
+    times = pd.date_range(first, periods=rows, freq=f"{minutes}min")
+    devices = ("hall", "bath") if draw.random() < 0.25 else ("",)
+    count = int(draw.integers(1, 4))
+    path = draw.normal(size=(rows, count * len(devices)))
+    for row in range(1, rows):
+        path[row] += 0.9 * path[row - 1]
+    suffix = draw.random() < 0.2
+    values = np.round(900.0 + 100.0 * path if suffix else 20.0 + path, 1)
+    cells = values.astype(object)
+    if suffix:
+        large = values >= 1000.0
+        cells[large] = [f"{value / 1000.0:.4f}k" for value in values[large]]
+    elif draw.random() < 0.3:  # an error code
+        hit = draw.random(rows) < 0.02
+        hit[:: rows // 5] = True
+        cells[hit, 0], values[hit, 0] = float(draw.choice(CODES)), np.nan
+    names = [f"s{place}" for place in range(count)]
+    days = [time if time.hour else time - pd.Timedelta("1D") for time in times]
+    stamps = {"time": [time.strftime(clock) for time in times]}
+    if clock == "24:00":
+        stamps = {
+            "time": [
+                f"{d:%d.%m.%Y} {t.hour or 24:02d}:00" for d, t in zip(days, times, strict=True)
+            ]
+        }
+    elif clock == "hours":
+        stamps = {"date": [f"{d:%Y-%m-%d}" for d in days], "hour": [t.hour or 24 for t in times]}
+    elif clock == "HrMn":
+        stamps = {"date": [f"{t:%Y%m%d}" for t in times], "HrMn": [t.hour * 100 for t in times]}
+    parts = []
+    for place, device in enumerate(devices):
+        own = cells[:, place * count : (place + 1) * count]
+        part = pd.DataFrame(stamps) if not device else pd.DataFrame(stamps).assign(room=device)
+        parts.append(part.assign(**dict(zip(names, own.T, strict=True))))
+    table = pd.concat(parts).sort_index(kind="stable") if len(parts) > 1 else parts[0]
+    separator = str(draw.choice([",", ";", "\t", "|", " "]))
+    if separator == " " and " " in str(table.iloc[0, 0]):
+        separator = ";"
+    text = table.to_csv(index=False, sep=separator)
+    head, body = text.split("\n", 1)
+    if draw.random() < 0.2 and separator != " ":  # a row of units
+        units = ["" for _ in [*stamps, *(["room"] if devices[0] else [])]] + ["°C"] * count
+        body = separator.join(units) + "\n" + body
+    if draw.random() < 0.2:
+        body += draw.choice(["# end of file\n", f"Total{separator}{rows}\n", "\n\n"])
+    if draw.random() < 0.1 and separator == ";":
+        head = f"sep=;\n{head}"
+    content = f"{head}\n{body}".encode(str(draw.choice(ENCODINGS)), "replace")
+    channels = [f"{name} {device}".strip() for device in devices for name in names]
+    channels = list(devices) if count == 1 < len(devices) else channels
+    refusal = {"%d/%m/%Y %I:%M": "from 1 to 12", "%d/%m/%Y %H:%M CET": "zone 'CET'"}.get(clock)
+    truth = pd.DataFrame(values, times, channels)
+    return Strange("", truth, None, 60.0 * minutes, content, refusal)
