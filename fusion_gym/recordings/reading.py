@@ -491,6 +491,9 @@ def without_codes(
             raise ConfigurationError(
                 f"{source} is not allowed: its channel {name!r} has error codes alone"
             )
+        remarks += [f"{name}: {count} readings of {value:g} are far from all others; "
+                    f"--error-code={value:g} drops them"
+                    for value, count in _far_values(result[name].dropna().to_numpy())]  # fmt: skip
     for code in codes:
         if not (values == code).to_numpy().any():
             remarks.append(f"no reading is the error code {code:g}")
@@ -524,6 +527,16 @@ def _error_codes(values: Array) -> list[tuple[float, int]]:
         if gap > (0.5 if known else 1.0) * (high - low) and between <= 0.1 * count and brief:
             result.append((code, count))
     return result
+
+
+def _far_values(values: Array) -> list[tuple[float, int]]:
+    """Return a lowest or highest value that is repeated far from all others, with its count."""
+    distinct, counts = np.unique(values, return_counts=True)
+    if len(distinct) < 10:
+        return []
+    ends = (0, 1, distinct[-1] - distinct[1]), (-1, -2, distinct[-2] - distinct[0])
+    return [(float(distinct[end]), int(counts[end])) for end, other, span in ends
+            if counts[end] > 1 and abs(distinct[end] - distinct[other]) > 0.5 * span]  # fmt: skip
 
 
 def _is_code(value: float) -> bool:

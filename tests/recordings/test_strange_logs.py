@@ -128,6 +128,34 @@ def test_every_device_has_channels_of_its_own(name: str, tmp_path: Path) -> None
         np.testing.assert_allclose(recording.values[channel].to_numpy(), values, rtol=1e-12)
 
 
+TURN = np.sin(np.arange(ROWS) / 4.0)
+FAR = {
+    "two runs of zeros": (
+        np.where(np.arange(ROWS) % 40 < 15, 0.0, VALUES + 20.0),
+        "45 readings of 0",
+    ),
+    "a code twice": (np.where(np.arange(ROWS) % 50 == 7, -55.0, VALUES), "2 readings of -55"),
+    "the sun at night": (np.round(np.maximum(TURN, 0.0) * 900.0), ""),
+    "rain": (np.where(np.arange(ROWS) % 7, 0.0, np.round(2.0 * TURN**2, 1)), ""),
+    "a contact": (np.arange(ROWS) // 9 % 2 * 1.0, ""),
+}
+
+
+@pytest.mark.parametrize("name", FAR)
+def test_repeated_values_far_from_all_others_are_named(name: str, tmp_path: Path) -> None:
+    values, remark = FAR[name]
+    path = tmp_path / "log.csv"
+    pd.DataFrame({"time": HOURS, "a": values}).to_csv(path, index=False)
+    recording = Recording.read(path)
+    assert remark in "".join(recording.remarks)
+    assert ("far from" in "".join(recording.remarks)) == bool(remark)
+    if remark:
+        code = float(remark.split()[-1])
+        without = Recording.read(path, error_codes=[code])
+        assert without.values["a"].min() > code
+        assert "far from" not in "".join(without.remarks)
+
+
 def parquet() -> bytes:
     return b"PAR1" + bytes(100) + b"PAR1"
 
