@@ -211,10 +211,10 @@ def _copies(values: pd.DataFrame) -> dict[str, str]:
     return result
 
 
-def _is_rounded(one: pd.Series, other: pd.Series, resolution: float, own: float) -> bool:
-    """Return whether a line through one column gives the other up to their resolutions."""
-    known = one.notna() & other.notna()
-    x, y = one[known].to_numpy(), other[known].to_numpy()
+def _is_rounded(first: pd.Series, other: pd.Series, resolution: float, own: float) -> bool:
+    """Return whether a line through the first column gives the other up to their resolutions."""
+    known = first.notna() & other.notna()
+    x, y = first[known].to_numpy(), other[known].to_numpy()
     if len(x) < 20 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return False
     slope, level = np.polyfit(x, y, 1)

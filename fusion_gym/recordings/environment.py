@@ -59,7 +59,7 @@ class RecordedFusionOptions(LinearFusionOptions):
     fit_share: float = 0.5
     """Share of the log, from its start, that was fitted."""
     source: Literal["recorded", "fitted", "resampled", "normal"] = "recorded"
-    """Source of the process noise: ``"recorded"`` replays the windows, ``"fitted"`` those of the
+    """Source of the process noise: ``"recorded"`` replays the windows, ``"fitted"`` windows of the
     fitted part. ``"resampled"`` draws from the residuals of the fitted part, for training.
     ``"normal"`` draws from the plant's model."""
 
