@@ -122,6 +122,12 @@ class Field(FitOptions, Long):
         criticism = fitting.criticise(plant, values[rows:])
         warnings = [*recording.remarks, *plant.remarks]
         warnings += fitting.warnings_of(plant, values[rows:], criticism)
+        if self.device == "zigbee":
+            warnings += [
+                f"{c.name}: zigbee has no step for the unit {c.unit!r}; give --unit {c.name}=°C"
+                for c in recording.channels
+                if c.unit not in field_report.ATTRIBUTES
+            ]
         warn(warnings)
         with files.lock_folder(self.output, "output"):
             writing(("the report", self.output / "report.html"))

@@ -17,6 +17,7 @@ import tyro
 import yaml
 
 from fusion_gym.commands.command_line import Command, OutputFile, between
+from fusion_gym.errors import refusal
 from fusion_gym.output.files import write_text
 from fusion_gym.output.progress import remark, writing
 from fusion_gym.output.tables import console, table_tables
@@ -36,12 +37,18 @@ class LogOptions:
     """Unit of numeric times; by default their head names it."""
     error_code: tuple[float, ...] = ()
     """Values that are no readings, beside the recognised ones."""
+    unit: tuple[str, ...] = ()
+    """Units of channels as NAME=UNIT, in place of the heads' units."""
 
     @property
     def reading(self) -> Mapping[str, Any]:
         """Keyword arguments of ``Recording.read``."""
+        for word in self.unit:
+            if "=" not in word:
+                raise refusal("unit", word, "NAME=UNIT, such as air=°C")
+        units = dict(word.split("=", 1) for word in self.unit)
         return {"date_format": self.date_format, "time_unit": self.time_unit,
-                "error_codes": self.error_code}  # fmt: skip
+                "error_codes": self.error_code, "units": units}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -110,7 +110,8 @@ _HUMIDITY = "Relative Humidity 0x0405", 0.01, 65_535
 # Cluster, step in the unit and most steps of MeasuredValue, by unit.
 ATTRIBUTES = {
     "°C": _TEMPERATURE, "C": _TEMPERATURE, "degC": _TEMPERATURE, "K": _TEMPERATURE,
-    "%": _HUMIDITY, "%RH": _HUMIDITY,
+    "°F": ("Temperature Measurement 0x0402", 0.018, 32_767), "%": _HUMIDITY,
+    "Pa": ("Pressure Measurement 0x0403", 100.0, 32_767),
     "kPa": ("Pressure Measurement 0x0403", 0.1, 32_767),
     "hPa": ("Pressure Measurement 0x0403", 1.0, 32_767),
     "mbar": ("Pressure Measurement 0x0403", 1.0, 32_767),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,8 @@ SHIPPED = {name: Path(__file__).with_name(f"{name}.csv{end}")
            for name, end in (("tanks", ""), ("mast", ".xz"))}  # fmt: skip
 _LIMIT = r"-?[0-9]+(?:\.[0-9]+)?|-?\.[0-9]+"
 _ENDS = {"low": -np.inf, "high": np.inf}
+_ROUND_UNIT = r"\(([°℃℉%].{0,4}|[mhk]?Pa|mbar|deg ?[CF]|[CFK]|[mk]?[VAWm]|[cm]m|ppm|lx|k?Wh|m/s)\)"
+_UNITS = {"℃": "°C", "deg C": "°C", "℉": "°F", "deg F": "°F", "%RH": "%", "% RH": "%", "%rH": "%"}
 _HEAD = re.compile(
     r"(?P<name>[^\[\]]*?[^\[\]\s])\s*(\[(?P<unit>[^\[\]]*)\])?"
     rf"(\s+(?P<low>{_LIMIT})?\.\.(?P<high>{_LIMIT})?)?"
@@ -55,6 +57,7 @@ class Recording:
         date_format: str | None = None,
         time_unit: str | None = None,
         error_codes: Sequence[float] = (),
+        units: Mapping[str, str] | None = None,
     ) -> Recording:
         """Read a log from a CSV file.
 
@@ -72,6 +75,7 @@ class Recording:
             time_unit: unit of numeric times: ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, ``"min"``,
                 ``"h"``, ``"d"`` or ``"excel"``. By default the head names it.
             error_codes: values that are no readings, beside those that are recognised.
+            units: units of channels by name, in place of the heads' units.
 
         Raises:
             ConfigurationError: the file cannot be read as a log.
@@ -91,7 +95,7 @@ class Recording:
             raise ConfigurationError(
                 f"{source} is not allowed: its channels are {names}, and must be different ones"
             )
-        numbers, units = reading.numbers_of(table.set_axis(names, axis=1), source)
+        numbers, cell_units = reading.numbers_of(table.set_axis(names, axis=1), source)
         numbers[np.abs(numbers) > LARGEST] = np.nan
         absent = np.isnan(numbers)
         keep = np.flatnonzero(~absent.all(0))
@@ -103,8 +107,13 @@ class Recording:
         remarks += [f"column {name!r} has no numbers: left out" for name in without]
         lost = int((table.notna().to_numpy() & absent)[:, keep].sum())
         remarks += [f"{lost} cells without a finite number up to 1e15: no reading"] if lost else []
-        channels = [replace(channels[place], unit=channels[place].unit or units[place])
+        channels = [replace(channels[place], unit=channels[place].unit or cell_units[place])
                     for place in keep]  # fmt: skip
+        for name, unit in (units or {}).items():
+            if name not in [channel.name for channel in channels]:
+                raise refusal("unit", name, f"one of {', '.join(c.name for c in channels)}")
+            channels = [replace(c, unit=unit) if c.name == name else c for c in channels]
+        channels = [replace(c, unit=_UNITS.get(c.unit, c.unit)) for c in channels]
         own = pd.DataFrame(numbers[:, keep], columns=[channel.name for channel in channels])
         values = reading.on_even_times(own, times, source, remarks)
         return cls(
@@ -194,7 +203,7 @@ class Recording:
 
 
 def _channel(head: str, source: str) -> RecordedChannel:
-    match = _HEAD.fullmatch(" ".join(head.split()))
+    match = _HEAD.fullmatch(re.sub(_ROUND_UNIT, r"[\1]", " ".join(head.split())))
     low, high = (float(match[end] or size) if match else 0 for end, size in _ENDS.items())
     if match is None or ".." in match["name"] or not low < high:
         raise ConfigurationError(

@@ -12,6 +12,7 @@ from log_formats import draw_strange_log
 from refusals import refused
 
 from fusion_gym.recordings import Recording
+from fusion_gym.recordings.field_report import fields_of
 from fusion_gym.validation import ConfigurationError
 
 ROWS = 96
@@ -154,6 +155,20 @@ def test_repeated_values_far_from_all_others_are_named(name: str, tmp_path: Path
         without = Recording.read(path, error_codes=[code])
         assert without.values["a"].min() > code
         assert "far from" not in "".join(without.remarks)
+
+
+def test_units_are_read_from_round_brackets_and_given(tmp_path: Path) -> None:
+    heads = ["a (°C)", "b [℃]", "c (hall)", "d (% RH)", "e", "f [Pa]"]
+    frame = pd.DataFrame(dict.fromkeys(heads, VALUES), HOURS) * [1, 2, 3, 4, 5, 6]
+    frame.to_csv(tmp_path / "log.csv", index_label="time")
+    recording = Recording.read(tmp_path / "log.csv", units={"e": "°F"})
+    units = {channel.name: channel.unit for channel in recording.channels}
+    assert units == {"a": "°C", "b": "°C", "c (hall)": "", "d": "%", "e": "°F", "f": "Pa"}
+    refused(
+        lambda: Recording.read(tmp_path / "log.csv", units={"g": "m"}), "unit = 'g'", "one of a"
+    )
+    for unit, change in (("°C", 1.0), ("°F", 1.8), ("Pa", 10_000.0), ("hPa", 100.0)):
+        assert fields_of("zigbee", unit, change, 60.0, 600.0)["reportable_change"] == 100
 
 
 def parquet() -> bytes:
