@@ -31,7 +31,7 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
 from fusion_gym.declaration import plain_options
 from fusion_gym.entries import Plain
-from fusion_gym.envs.views import SensorView
+from fusion_gym.envs.views import LARGEST_RATIO, SensorView, space_with_ratios
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.importing import require
 from fusion_gym.policies.base import Policy, Requests
@@ -52,7 +52,7 @@ class DecisionGraph(torch.nn.Module):
 
     - ``observation`` (B, entries) float32, clipped by the graph to the bounds of the layout;
       ``entries`` are the names, without the price if the agent has a fixed price, which is a
-      constant of the graph.
+      constant of the graph. The log ratios of the agent's rule come last.
     - ``grantable`` (B, k) bool, the sensors that the network would grant; only for MaskablePPO.
     - ``hidden`` and ``cell`` (layers, B, size) float32, zero at the start of an episode; only for
       RecurrentPPO. Their next values are the outputs ``hidden_next`` and ``cell_next``.
@@ -76,9 +76,6 @@ class DecisionGraph(torch.nn.Module):
             allowed = "True; the graph also returns the probability of every request"
             raise refusal("deterministic", False, allowed, "here")
         agent.refuse_frames()
-        if agent.rule is not None:
-            allowed = "none: an exported file does not compute the log ratios of a rule"
-            raise refusal("rule", type(agent.rule).__name__, allowed, "here")
         action = agent.view.action
         if not action.bits and isinstance(action.space, spaces.MultiDiscrete):
             allowed = "another kind, because the graph requests without channels"
@@ -101,12 +98,15 @@ class DecisionGraph(torch.nn.Module):
             raise refusal("action", "threshold", "another kind with RecurrentPPO", "here")
         self._price = agent.price
         self._place = agent.view.names.index("price") if agent.price is not None else None
-        stored = [place for place in range(len(agent.view.names)) if place != self._place]
-        self.entries = tuple(agent.view.names[place] for place in stored)
+        space, own = space_with_ratios(agent.view, agent.rule is not None), len(agent.view.names)
+        ratios = (f"log_ratio[{place}]" for place in range(space.shape[0] - own))
+        self.names = *agent.view.names, *ratios
+        stored = [place for place in range(len(self.names)) if place != self._place]
+        self.entries = tuple(self.names[place] for place in stored)
         self.low: torch.Tensor
         self.high: torch.Tensor
-        self.register_buffer("low", torch.as_tensor(agent.view.space.low[stored]))
-        self.register_buffer("high", torch.as_tensor(agent.view.space.high[stored]))
+        self.register_buffer("low", torch.as_tensor(space.low[stored]))
+        self.register_buffer("high", torch.as_tensor(space.high[stored]))
         self.choices: np.ndarray[Any, Any] | None = None  # requests (choices, k) of each action
         if isinstance(action.space, spaces.Discrete):
             table = np.eye(2, 1, -1) if agent.view.local else action.table
@@ -260,6 +260,11 @@ def onnx_card(
     if local and task.options.own_number:
         number = Block("sensor", "number of the sensor", np.array, (numbered(task.sensors),))
         blocks.append(_block(number, local))
+    if agent.rule is not None:
+        meaning = f"logarithm of score over threshold of {agent.rule_text}"
+        labels = (numbered(len(graph.names) - len(agent.view.names)),)
+        ratio = Block("log_ratio", meaning, np.array, labels, limit=LARGEST_RATIO)
+        blocks.append(_block(ratio, local))
     price = task.reward.price.span
     low, high = price or (1.0, 1.0)
     digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
@@ -385,7 +390,7 @@ class Agreement:
         self.knowledge: Knowledge = agent.knowledge
         self.memory_owner = agent.memory_owner
         self._agent, self._graph, self._session = agent, graph, session(path)
-        self._columns = [agent.view.names.index(name) for name in graph.entries]
+        self._columns = [graph.names.index(name) for name in graph.entries]
         self.observations, self.episodes, self.different = 0, 0, 0
         self.difference, self.relative = 0.0, 0.0
 

@@ -1,6 +1,7 @@
 """Branches over a window: their costs, the start at a rule, the saved file, errors."""
 
 import copy
+import json
 import os
 import signal
 from itertools import product
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from small_runs import meaning
@@ -18,6 +20,7 @@ import fusion_gym
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch
+from fusion_gym.envs.views import LARGEST_RATIO
 from fusion_gym.evaluation.episodes import run_priced
 from fusion_gym.evaluation.onnx_export import export_onnx
 from fusion_gym.policies.saved import ModelPolicy, ModelView, tag_model
@@ -153,8 +156,15 @@ def test_a_trained_agent_is_a_file_like_any_other(case: str, tmp_path: Path) -> 
     np.testing.assert_array_equal(means.cost(each)[3:6], same.cost(0.1)[3:6])
     rest = fusion_gym.evaluation.run_episodes(task, agent, 3, seed=0)
     assert np.isfinite(rest.returns).all()
-    with pytest.raises(ConfigurationError, match="rule"):
-        export_onnx(agent, task, str(tmp_path / "agent.onnx"), experiment.environment.id)
+    for policy, priced in ((agent, 1), (fixed, 0)):
+        file = tmp_path / f"agent{priced}.onnx"
+        export_onnx(policy, task, file, experiment.environment.id)
+        texts = {item.key: item.value for item in onnx.load(file).metadata_props}
+        names, ratios = json.loads(texts["observation_names"]), task.sensors if not local else 1
+        assert names[-ratios:] == [f"log_ratio[{place}]" for place in range(ratios)]
+        assert ("price" in names) == priced
+        assert json.loads(texts["observation_high"])[-1] == LARGEST_RATIO
+        assert agent.rule_text in texts["observation_blocks"]
 
 
 def test_a_file_names_no_policy_that_may_run_code(tmp_path: Path) -> None:
