@@ -24,12 +24,6 @@ _PHASE = 1e-3  # of an interval: a channel that reads later than the first by mo
 _FIRST, _LAST = 1678, 2261  # years that nanoseconds reach
 _SAMPLE = 200  # lines or rows that show the layout of a file
 _ROUND = 3600.0, 60.0, 10.0, 1.0, 0.1, 0.01, 1e-3, 1e-6, 1e-9  # seconds of round intervals
-_FOOTER = 10  # lines under the rows, at most
-_BINARIES = {
-    b"PK\x03\x04": "a workbook or an archive: save the sheet as CSV",
-    b"\xd0\xcf\x11\xe0": "a workbook: save the sheet as CSV",
-    b"PAR1": "Parquet: write it by pandas.read_parquet(path).to_csv(file)",
-}
 _SHARE, _COUNT = 0.05, 3  # most readings and least count of an error code beside the known ones
 _CODES = {-127.0, 85.0, 32767.0, -32768.0, 65535.0, 6553.5, 3276.7, -3276.8, 327.67, -327.68}
 
@@ -38,24 +32,40 @@ TIME_UNITS = {  # and their words in heads
     "us": "us|µs|μs|microseconds?", "ns": "ns|nanoseconds?", "min": "mins?|minutes?",
     "h": "h|hrs?|hours?", "d": "d|days?",
 }  # fmt: skip
-_CLOCK_HEAD = re.compile("time|date|unix|epoch|stamp", re.IGNORECASE)
-_DATE = r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})"
-_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?(?:\s*[AaPp]\.?[Mm]\.?)?"
-_ORDERS = {"year first": (0, 1, 2), "day first": (2, 1, 0), "month first": (2, 0, 1)}
-_COMPACT = r"((?:19|20)\d\d)(0[1-9]|1[0-2])(0[1-9]|[12]\d|3[01])"
-_COMPACT_CLOCK = r"([01]\d|2[0-4])([0-5]\d)?([0-5]\d)?"
-_HOUR_HEAD = re.compile(r"(hr_?mn|hhmm|hours?|hrs?|h|stunde|uhrzeit|time)\b.*", re.IGNORECASE)
-_WEEKDAY = r"^(?:MON|TUE|WED|THU|FRI|SAT|SUN)[A-Z]*[.,]?\s+"
-_MONTH = r"(?i)\b(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)"
-_TWELVE = "%Y-%m-%d %I:%M:%S %p", "%Y-%m-%d %I:%M %p"
-_IDS = "sensor|channel|device|node|station|id"  # whose numbers are names, too
-_NAMES = re.compile(
-    rf"entity_id|_field|name|({_IDS}|variable|parameter|metric|tag|topic|series|signal|quantity|point|"
-    "room|location|place|zone|site|host|mac|address|model)([ _]?(id|name|type))?",
-    re.IGNORECASE,
+_CLOCK_HEAD = re.compile("time|date|unix|epoch|stamp|elapsed", re.IGNORECASE)
+_HOUR_HEAD = re.compile(
+    r"(?i)h|(hrs?|hours?|hr_?mn|hhmm(ss)?|(obs |local )?time|stunde|uhrzeit|zeit|heure|hora)\b.*"
 )
-_FACTORS = {"k": 1e3, "M": 1e6, "G": 1e9}
-_VALUES = re.compile("_?value|state|reading|measurement", re.IGNORECASE)
+_PARTS = {
+    "year": "(?i:years?|yr|yyyy)|YY", "month": "(?i:months?|mo)|MM", "day": "(?i:days?|dy)|DD",
+    "hour": "(?i:hours?|hr)|hh", "minute": "(?i:minutes?|min|mn)|mm",
+}  # fmt: skip
+_DATE = r"(\d{1,4})[-/.](\d{1,2})[-/.](\d{1,4})"
+_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:\.\d+)?)?(?: [AP]M)?"
+_MONTH = r"\b(?:JAN|FEB|MAR|APR|MAY|JUN|JUL|AUG|SEP|OCT|NOV|DEC)[A-Z]*"
+_ZONE = rf"(?:(?<=\d)|\s)\s*(?!(?:UTC|GMT|[AP]M|UHR|{_MONTH})$)([A-Z]{{2,5}}|\[?[A-Z]+/[A-Z_]+]?)$"
+_SPELLINGS: tuple[tuple[str, Any], ...] = (
+    (r"\b(?:MON|TUE|WED|THU|FRI|SAT|SUN)[A-Z]*\b[.,]*\s*", ""),
+    (r"\s*(?:UTC|GMT)(?=[+-]\d)|\s*(?:UTC|GMT|UHR)$", ""),
+    (_ZONE, ""),
+    (r"(?<=\d),(?=\d)", "."),
+    (r"\s*\b([AP])\.?\s?M\.?$|(?<=\d)([AP])\.?M\.?$", lambda m: f" {m[1] or m[2]}M"),
+    # YYYYMMDD, perhaps with HH, HHMM or HHMMSS
+    (r"^((?:18|19|20)\d\d)(0[1-9]|1[0-2])(0[1-9]|[12]\d|3[01])(?=$|[T ]?([01]\d|2[0-4]))"
+     r"(?:[T ]?\d\d:?([0-5]\d)?:?([0-5]\d(?:\.\d+)?)?)?(?=$|Z|[+-])",
+     lambda m: "-".join(m.groups()[:3]) + f" {m[4]}:{m[5] or '00'}:{m[6] or '00'}" * bool(m[4])),
+)  # fmt: skip
+_ORDERS = {"year first": (0, 1, 2), "day first": (2, 1, 0), "month first": (2, 0, 1)}
+_TWELVE = "%Y-%m-%d %I:%M:%S %p", "%Y-%m-%d %I:%M %p"
+_PLACE = "(sensor|channel|device|station|node|room|zone|mac|serial|host|site|location|probe)s?"
+_NAMES = re.compile(
+    f"(?i)entity_id|_field|id|name|model|place|building|floor|area|ort|raum|zimmer|gerät|({_PLACE}|"
+    "variable|parameter|metric|tag|topic|series|signal|quantity|point)"
+    "([ _-]?(id|name|type|no|nr|number|model|address))?"
+)
+_IDS = re.compile(f"(?i)id|name|.*[ _-]id|{_PLACE}([ _-]?(id|no|nr|number|address))?")
+_VALUES = re.compile("(?i)_?value|state|reading|measurement|wert|messwert|valeur|valor")
+_FACTORS = {"k": "e3", "M": "e6", "G": "e9"}
 _CELL = r"([+-]?[\d., ]*\d\.?(?:[eE][+-]?\d+)?)\s*([^\d\s.,+'-]\D{0,9}\d?)?"
 _SPREAD = 3.0  # ratio of the relative deviations of two ways to read a column's numbers
 
@@ -67,18 +77,22 @@ def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
             raise ValueError("it is no regular file")
         with get_handle(path, "rb", compression="infer", is_text=False) as handle:
             raw = handle.handle.read(LONGEST_TEXT + 1)
-        for start, reason in _BINARIES.items():
-            if raw.startswith(start):
-                raise ValueError(reason)
+        if raw.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
+            raise ValueError("it is an Excel workbook or an archive: save the sheet as CSV")
+        if raw.startswith(b"PAR1"):
+            raise ValueError("it is Parquet: write it by pandas.read_parquet(path).to_csv(...)")
         try:
-            utf_16 = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
-            text = raw.decode("utf-16" if utf_16 else "utf-8-sig")
+            text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
         except UnicodeDecodeError:
             text = raw.decode("cp1252")
-        text = re.sub(r"(?m)^#.*\n(?=\D|\Z)", "", text)
-        text = re.sub(r"""(?i)\A"?sep=.{1,2}"?\r?\n""", "", text)
-        width, separator, above = _layout(text)
-        text, below = _without_footer(text, separator, width)
+        named = re.match(r'"?sep=(.)"?\r?\n', text, re.IGNORECASE)
+        text = re.sub(r"(?m)^#.*\n(?=\D)", "", text[named.end() if named else 0 :])
+        width, separator, above = _layout(text, named[1] if named else ",;\t| ")
+        lines = text.rstrip("\r\n ").rsplit("\n", _LEAST)
+        rows = [bool(re.match(r"\s*[\"']?\d", line)) or _width(line, separator) == width
+                for line in reversed(lines[1:])]  # fmt: skip
+        below = [*rows, True].index(True)
+        text = "\n".join(lines[: len(lines) - below])
         if len(raw) > LONGEST_TEXT or width > 1 + LONGEST or "\0" in text:
             most = f"above {LONGEST_TEXT:,} bytes or {LONGEST} channels, or binary"
             raise ValueError(f"{width} columns: {most}")
@@ -97,43 +111,33 @@ def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
         text = text or type(error).__name__
         text += "; quote decimal commas" if isinstance(error, pd.errors.ParserError) else ""
         raise refusal("log", str(path), f"a CSV file ({text})") from None
-    if text.lstrip('"').startswith("TOA5") and len(cells) > 2:  # units and aggregations
-        units = cells.iloc[1].fillna("")
-        heads = heads.where(units.isin(("", "TS", "RN")), heads + " [" + units + "]")
-        cells = cells.iloc[2:]
+    if len(cells) > 2 and not cells.iloc[1].str.contains(r"^[+-]?[\d.]|\d\d", na=False).any():
+        units = cells.iloc[1].fillna("").str.replace(r"[\[\]()]", "", regex=True)
+        named = units.isin(("", "-", "TS", "RN")) | heads.str.contains(r"\[|\.\.")
+        heads = heads.where(named, heads + " [" + units + "]")
+        cells = cells.iloc[2 if text.lstrip('"').startswith("TOA5") else 1 :]  # aggregations
     remarks += [f"{above} lines above the heads: left out"] if above else []
     remarks += [f"{below} lines below the rows: left out"] if below else []
+    # Deutscher Wetterdienst's code may be frequent.
+    cells = cells.replace("-999", np.nan) if "MESS_DATUM" in set(heads) else cells
     return cells.iloc[1:].set_axis(list(heads), axis=1).reset_index(drop=True)
 
 
-def _layout(text: str) -> tuple[int, str, int]:
+def _layout(text: str, separators: str) -> tuple[int, str, int]:
     """Return the number of columns, the separator, and the number of lines above the heads."""
     lines, choices = text.split("\n", _SAMPLE)[:_SAMPLE], []
-    for separator in ",;\t| ":
-        widths = _widths(lines, separator)
+    for separator in separators:
+        widths = [_width(line, separator) for line in lines]
         width = max(widths, key=widths.count)
         above = 1 if text.lstrip('"').startswith("TOA5") else widths.index(width)
-        choices.append((widths.count(width) * (width > 1), width, separator, above))
-    single = max(choices[:-1])[0] == 0 and choices[-1][-1] == 0  # no head is above
-    return max(choices if single else choices[:-1])[1:]
+        doubt = 0.6 * bool(re.match(r"\s*\d", lines[above])) + 0.5 * (separator == " ")
+        count = widths.count(width) * (width > 1) - doubt * len(lines)
+        choices.append((count, separator != " ", width, separator, above))
+    return max(choices)[2:]
 
 
-def _widths(lines: Sequence[str], separator: str) -> list[int]:
-    """Return the number of cells of each line."""
-    plain = [line.strip(" \r") for line in lines] if separator == " " else lines
-    rows = csv.reader(plain, delimiter=separator, skipinitialspace=True)
-    return [len(row) for row in rows]
-
-
-def _without_footer(text: str, separator: str, width: int) -> tuple[str, int]:
-    """Return the text without last lines of other widths, and their number."""
-    lines = text.rstrip().split("\n")
-    count = 0
-    while len(lines) > 1 and _widths([lines[-1]], separator) != [width]:
-        if re.match(r"\W*\d", lines.pop()) or count == _FOOTER:
-            return text, 0
-        count += 1
-    return "\n".join([*lines, ""]), count
+def _width(line: str, sign: str) -> int:
+    return len(next(csv.reader([line.strip(" \r")], delimiter=sign, skipinitialspace=True), ()))
 
 
 def split_times(
@@ -143,19 +147,22 @@ def split_times(
     """Return the times of the rows, NaT where a row has none, and the other columns."""
     columns = [table.iloc[:, place] for place in range(table.shape[1])]
     samples = [column.dropna().head(_SAMPLE) for column in columns]
-    dates, clocks = (
-        [place for place, own in enumerate(samples) if len(own) and own.str.fullmatch(form).all()]
-        for form in (_DATE, _CLOCK)
+    plain = [_spelled(own) for own in samples]
+    dates, clocks, hours = (
+        [place for place, own in enumerate(plain) if own.str.fullmatch(form).mean() > 0.9]
+        for form in (_DATE, _CLOCK, r"\d{1,6}")
     )
-    if not clocks:
-        days = [place for place, own in enumerate(samples)
-                if len(own) and own.str.fullmatch(_COMPACT).all()]  # fmt: skip
-        for place in [place for place, own in enumerate(samples) if dates or days]:
-            if (clock := _clock_of(columns[place], str(table.columns[place]))) is not None:
-                columns[place], clocks, dates = clock, [place], dates or days
-                break
-    if dates and clocks:
-        cells, used = columns[dates[0]] + " " + columns[clocks[0]], {dates[0], clocks[0]}
+    hours = [place for place in hours if _HOUR_HEAD.fullmatch(table.columns[place])
+             and dates and columns[dates[0]].duplicated().mean() > 0.5]  # fmt: skip
+    parts = {unit: place for unit, form in _PARTS.items()
+             for place, head in enumerate(table.columns) if re.fullmatch(form, head)}  # fmt: skip
+    if {"year", "month", "day"} <= parts.keys() and date_format is None:
+        frame = table.iloc[:, [*parts.values()]].set_axis([*parts], axis=1)
+        cells, used = pd.to_datetime(frame, errors="coerce").astype(str), set(parts.values())
+    elif dates and (clocks or (hours and date_format is None)):
+        clock = columns[clocks[0]] if clocks else _clock(columns[hours[0]])
+        date = columns[dates[0]] if date_format else _spelled(columns[dates[0]])
+        cells, used = date + " " + clock, {dates[0], (clocks or hours)[0]}
     else:
         readings = [_times(own, date_format, time_unit) for own in samples]
         shares = [max((t.notna().mean() for t in own.values()), default=0.0) for own in readings]
@@ -170,16 +177,20 @@ def split_times(
     return times, table.iloc[:, [n for n in range(len(columns)) if n not in used | blank]]
 
 
-def _clock_of(cells: pd.Series, head: str) -> pd.Series | None:
-    """Return hours, or hours and minutes as one number, as texts such as 07:30."""
-    if not _HOUR_HEAD.fullmatch(head) or not cells.dropna().str.fullmatch(r"\d{1,4}").all():
-        return None
-    numbers = pd.to_numeric(cells)
-    numbers = numbers * 100 if numbers.max() <= 24 else numbers
-    if numbers.max() > 2400 or (numbers % 100).max() > 59:
-        return None
-    digits = numbers.map("{:04.0f}".format, na_action="ignore")
-    return digits.str[:2] + ":" + digits.str[2:]
+def _clock(hours: pd.Series) -> pd.Series:
+    """Return hours, or hours and minutes in one number, with colons."""
+    most = pd.to_numeric(hours, errors="coerce").max()
+    width = 4 if most > 24 or "m" in str(hours.name).lower().replace("time", "") else 2
+    digits = hours.str.zfill(6 if most > 2400 else width).str.ljust(6, "0")
+    return digits.str[:2] + ":" + digits.str[2:4] + ":" + digits.str[4:]
+
+
+def _spelled(cells: pd.Series) -> pd.Series:
+    """Return times in capitals, without weekdays and zones, with dashes in dates of digits."""
+    plain = cells.str.upper()
+    for form, text in _SPELLINGS:
+        plain = plain.str.replace(form, text, regex=True)
+    return plain.str.strip()
 
 
 def _is_numeric(cells: pd.Series) -> bool:
@@ -194,6 +205,11 @@ def _parse(
     choices = _times(cells, date_format, time_unit)
     if time_unit is not None and not _is_numeric(cells):
         raise refusal("time_unit", time_unit, "left out: the times of this log are no numbers")
+    zones = cells.str.upper().str.extract(_ZONE)[0].dropna()
+    if date_format is None and len(zones) and not _is_numeric(cells):
+        raise ConfigurationError(
+            f"{source} is not allowed: its times have the zone {zones.iloc[0]!r}; write UTC"
+        )
     scores = {order: _evenness(times) for order, times in choices.items()}
     order = max(scores, key=scores.__getitem__, default="")
     times = choices.pop(order, pd.Series(pd.NaT, cells.index))
@@ -205,20 +221,7 @@ def _parse(
             )
     if choices and order != "year first":
         remarks.append(f"dates such as {cells.dropna().iloc[0]!r} are read {order}")
-    falls, hours = times.dropna().diff() / pd.Timedelta("1h"), times.dt.hour.dropna()
-    twelve = hours.between(1, 12).all() and hours.nunique() > 6
-    if twelve and ((falls < -9.0) & (falls > -13.0)).any() and not cells.str.contains("[Mm]").any():
-        raise ConfigurationError(
-            f"{source} is not allowed: its clock goes from 1 to 12, such as "
-            f"{cells.dropna().iloc[0]!r}, without AM or PM; export 24 hours"
-        )
     lost = int(times.isna().sum())
-    zones = cells.str.extract(r"\d\s*([A-Z]{3,5})$")[0].dropna().unique()
-    if lost > len(times) / 2 and len(zones) and date_format is None:
-        raise ConfigurationError(
-            f"{source} is not allowed: its times have the zone {zones[0]!r}; export UTC, or "
-            "offsets such as +01:00"
-        )
     if lost > len(times) / 2 or len(times) - lost < _LEAST:
         for name, value in (("date_format", date_format), ("time_unit", time_unit)):
             if value is not None:
@@ -229,7 +232,16 @@ def _parse(
             "and numbers a unit in the head, as in 'elapsed [min]', or --time-unit"
         )
     remarks += [f"{lost} rows without a time: left out"] if lost else []
-    back = int((times.dropna().diff() < pd.Timedelta(0)).sum())
+    known = times.dropna()
+    change = known[known != known.shift()].diff().dropna() / pd.Timedelta("12h")
+    change *= -1.0 if change.median() < 0.0 else 1.0
+    halves = (change + 1.0).between(0.0, min(0.5, 2.0 * change.abs().median())).any()
+    shown = _is_numeric(_spelled(cells.head(_SAMPLE))) or cells.str.contains("(?i)[ap].?.?m").any()
+    if halves and known.dt.hour.between(1, 12).all() and not shown:
+        raise ConfigurationError(
+            f"{source} is not allowed: its clock has 12 hours without AM and PM; export one of 24"
+        )
+    back = int((known.diff() < pd.Timedelta(0)).sum())
     remarks += [f"{back} times before the row above: sorted"] if back else []
     return times.dt.tz_localize(None)
 
@@ -243,31 +255,24 @@ def _times(
             return {"": pd.to_datetime(cells, format=date_format, errors="coerce", utc=True)}
         except (TypeError, ValueError) as error:
             raise refusal("date_format", date_format, f"a format of strftime ({error})") from None
-    compact = cells.str.extract(f"^{_COMPACT}[ ]?{_COMPACT_CLOCK}$".replace("[ ]?", ""))
-    if time_unit is None and compact[0].notna().mean() > 0.9:
-        clock = compact[3] + ":" + compact[4].fillna("00") + ":" + compact[5].fillna("00")
-        cells = compact[0] + "-" + compact[1] + "-" + compact[2] + " " + clock
-    cells = cells.str.replace(rf"^{_COMPACT} (?=\d\d:)", r"\1-\2-\3 ", regex=True)
-    if _is_numeric(cells):
-        numbers = pd.to_numeric(cells, errors="coerce")
+    plain = _spelled(cells)
+    if _is_numeric(cells if time_unit else plain):
+        numbers = pd.to_numeric(cells, errors="coerce").replace([np.inf, -np.inf], np.nan)
         changes = numbers.diff().dropna()
         ordered = max((changes >= 0.0).mean(), (changes <= 0.0).mean()) > 0.75
-        unit = time_unit if ordered else None
-        unit = unit or _head_unit(str(cells.name), numbers, ordered)
-        if unit is None:
+        apart = np.diff(np.unique(numbers.dropna()))
+        if len(apart) > max(0.9 * len(numbers) - 1, 2):
+            ordered |= np.quantile(apart, 0.9) < 1.1 * np.quantile(apart, 0.1)
+        unit = time_unit or _head_unit(str(cells.name), numbers)
+        if unit is None or not (ordered or _CLOCK_HEAD.search(str(cells.name))):
             return {}
         size = numbers * pd.Timedelta(1, "D" if unit in ("d", "excel") else unit).value
         size += pd.Timestamp("1899-12-30").value if unit == "excel" else 0
         size = size.where(size.abs() < 9e18).round(0 if unit == "ns" else -3)
         return {"": pd.to_datetime(size, unit="ns", errors="coerce")}
-    plain = cells.str.upper().str.replace(r"(?<=\d),(?=\d)", ".", regex=True)
-    plain = plain.str.replace(r"\s*([AP])\.?M\.?$", r" \1M", regex=True)
-    plain = plain.str.replace(_WEEKDAY, "", regex=True)
-    midnight = plain.str.contains(r"[T\s]24:00(?::00)?$", na=False)
-    plain = plain.str.replace(r"([T\s])24:00(?=$|:00$)", r"\g<1>00:00", regex=True)
-    parts = plain.str.replace(r"\s*(?:UTC|GMT)$", "Z", regex=True).str.extract(
-        rf"^{_DATE}(?:[T.,\s]\s*(.*))?$"
-    )
+    ends = plain.str.contains(r"[T ]24:00(?::00)?(?:\.0+)?(?![:.\d])", na=False)
+    plain = plain.where(~ends, plain.str.replace("24:00", "00:00", n=1))
+    parts = plain.str.extract(rf"^{_DATE}(?:[T.,\s]\s*(.*))?$")
     result = {}
     for order, places in _ORDERS.items():
         year, month, day = (parts[place] for place in places)
@@ -278,18 +283,21 @@ def _times(
         for form in _TWELVE:
             times = times.fillna(pd.to_datetime(date, format=form, errors="coerce", utc=True))
         if times.notna().any():
-            result[order] = times + pd.to_timedelta(midnight.astype(int), "D")
-    words = cells.where(cells.str.contains(_MONTH, na=False))
-    return result or {"": pd.to_datetime(words, errors="coerce", utc=True, format="mixed")}
+            result[order] = times
+    if not result:
+        words = plain.where(plain.str.contains(_MONTH) & plain.str.contains(r"\d"))
+        result[""] = pd.to_datetime(words, errors="coerce", utc=True, format="mixed")
+    day = pd.Timedelta(1, "D")
+    return {order: times.where(~ends, times + day) for order, times in result.items()}
 
 
-def _head_unit(head: str, numbers: pd.Series, ordered: bool) -> str | None:
-    """Return the unit of numeric times, which are ordered or count from 1970."""
+def _head_unit(head: str, numbers: pd.Series) -> str | None:
+    """Return the unit of numeric times."""
     low, high = numbers.quantile((0.01, 0.99))
     for unit, factor in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
         if _CLOCK_HEAD.search(head) and 9e8 < low / factor <= high / factor < 4e9:
             return unit
-    words = re.sub(r"[^\wµμ]+|_", " ", head).strip() if ordered else ""
+    words = re.sub(r"[^\wµμ]+|_", " ", head).strip()
     units = (u for u, word in TIME_UNITS.items() if re.search(rf"(?i)\b(?:{word})$", words))
     return next(units, None)
 
@@ -307,51 +315,54 @@ def _evenness(times: pd.Series) -> int:
 def pivoted(
     times: pd.Series, table: pd.DataFrame, source: str, remarks: list[str]
 ) -> tuple[pd.Series, pd.DataFrame]:
-    """Return the times and columns of a log with one row a reading as one row a time."""
-    heads = [str(head) for head in table.columns]
-    names, values = ([head for head in heads if form.fullmatch(head)] for form in (_NAMES, _VALUES))
-    words = [h for h in heads if not table[[h]].iloc[:, 0].str.match(r"[+-]?\.?\d", na=False).any()]
-    if len(heads) == len(set(heads)) == 2 and times.duplicated().mean() > 0.3:
-        names = words or names
-        values = [h for h in heads if h not in names]
+    """Return the times and columns of a log with one row a reading or device as one row a time."""
+    rows = times.notna()
+    times, table = times[rows].reset_index(drop=True), table[rows].reset_index(drop=True)
+    heads = list(table.columns)
     if len(set(heads)) < len(heads):
         return times, table
-    long = len(values) == 1 and names
-    names = [h for h in names if long or h in words or re.match(rf"(?i){_IDS}", h)]
-    keys = [h for h in names if table[h].nunique() > 1] or (names[:1] if long else [])
-    if not keys:
-        if times.duplicated().mean() > 0.3:
-            for head in words:
-                if not table.assign(time=times).duplicated(["time", head]).any():
-                    raise ConfigurationError(
-                        f"{source} is not allowed: its rows at one time differ in {head!r}; export "
-                        "one device, or call this column 'device'"
-                    )
+    cells = {head: table[head].dropna().drop_duplicates() for head in heads}
+    shares = {head: own.str.fullmatch(_CELL).mean() for head, own in cells.items()}
+    varied = [h for h in heads if 1 < len(cells[h]) <= len(table) / 2
+              and not cells[h].str.fullmatch(r"-\d+|[+-]?\d*[.,]\d+").any()]  # fmt: skip
+    names = [h for h in heads if (_IDS if shares[h] > 0.5 else _NAMES).fullmatch(h)]
+    values = [h for h in heads if _VALUES.fullmatch(h) and shares[h] > 0.0]
+    if "_value" in heads:  # InfluxDB, whose other columns are tags
+        names = [h for h in heads if not re.fullmatch("result|table|_value|_start|_stop", h)]
+    if table[names].assign(**{"": times}).duplicated().mean() > 0.3:
+        names += [h for h in varied if shares[h] <= 0.5 and h not in names and (
+                  table[[*names, h]].assign(**{"": times}).duplicated().mean() < 0.05)]  # fmt: skip
+    keys, count = list[str](), 1
+    for head in (h for h in names if h in varied):
+        if (different := len(table[[*keys, head]].drop_duplicates())) > count:
+            keys, count = [*keys, head], different
+    keys = keys or names * (len(names) == len(values) == 1)
+    if len(values) != 1:
+        values = [head for head in heads if head not in {*names, *keys}]
+    if not keys or not values:
+        if times.duplicated().mean() > 0.5 and (times == times.dt.normalize()).all():
+            raise ConfigurationError(
+                f"{source} is not allowed: its times are dates without a clock; join both columns"
+            )
         return times, table
-    constant = [h for h in heads if _NAMES.fullmatch(h) and table[h].nunique() < 2]
-    values = values if long else [h for h in heads if h not in (*names, *constant)]
-    name = table[keys[0]].str.cat([table[key] for key in keys[1:]], sep=" ")
-    rows = table.assign(time=times, name=name).dropna(subset=["time", "name"])
-    single = rows.drop_duplicates(["time", "name"])
-    different, twice = single["name"].nunique() * len(values), len(rows) - len(single)
-    key = repr(keys[0]) if len(keys) == 1 else str(keys)
-    if different > LONGEST or twice > len(single) / 2:
+    label = table[keys[0]].fillna("").str.cat([table[key].fillna("") for key in keys[1:]], sep=" ")
+    long = table.assign(**{"": times, " ": label.str.strip()})[label.str.strip() != ""]
+    single = long.drop_duplicates(["", " "])
+    different, twice = single[" "].nunique(), len(long) - len(single)
+    name = " and ".join(map(repr, keys))
+    if different * len(values) > LONGEST or twice > len(single) / 2:
         raise ConfigurationError(
-            f"{source} is not allowed: its column {key} has {different} channels and {twice} "
+            f"{source} is not allowed: its column {name} has {different} channels and {twice} "
             f"readings at the time of another; export one place with at most {LONGEST} channels"
         )
     remarks += [f"{twice} readings at the time of another: the first counts"] if twice else []
-    if long:
-        remarks.append(f"one row a reading: columns are the values {values[0]!r} of each {key}")
-    else:
-        remarks.append(f"several devices in one table: a column for each {key}")
-    wide = single.pivot(index="time", columns="name", values=values)
-    order = [(value, name) for value in values for name in single["name"].unique()]
-    wide = wide[order]
-    heads = [name if long else re.sub(r"(?=\s*\[)|$", f" {name}", value, count=1)
-             for value, name in order]  # fmt: skip
-    wide = wide.set_axis(heads, axis=1).reset_index()
-    return wide["time"], wide.drop(columns="time")
+    shown = ", ".join(map(repr, values))
+    remarks.append(f"one row a reading: columns are the values {shown} of each {name}")
+    wide = single.pivot(index="", columns=" ", values=values)
+    wide = wide[[(value, own) for value in values for own in single[" "].unique()]]
+    wide.columns = [own if _VALUES.fullmatch(v) else re.sub(r"(?= \[|$)", f" {own}", v, count=1)
+                    for v, own in wide.columns]  # fmt: skip
+    return wide.index.to_series().reset_index(drop=True), wide.reset_index(drop=True)
 
 
 def numbers_of(table: pd.DataFrame, source: str) -> tuple[Array, list[str]]:
@@ -364,18 +375,19 @@ def numbers_of(table: pd.DataFrame, source: str) -> tuple[Array, list[str]]:
     for place, name in enumerate(table.columns):
         plain = table.iloc[:, place].str.replace("[\u00a0\u202f\u2009']", " ", regex=True)
         parts = plain.str.replace("\u2212", "-").str.extract(f"^{_CELL}$")
-        own, factors = parts[1].dropna().str.strip().unique(), None
-        if set(own) <= set(_FACTORS) and (parts[0].notna() & parts[1].isna()).any():
-            own, factors = own[:0], parts[1].str.strip().map(_FACTORS).fillna(1.0)
-        if len(own) > 1:
+        unit = parts[1].str.strip()
+        own = unit.dropna().unique()
+        bare = pd.to_numeric(parts[0][unit.isna()].dropna(), errors="coerce").unique()
+        mixed = not all(map(_is_code, bare))
+        if len(own) and (mixed or len(own) > 1) and set(own) <= set(_FACTORS):
+            parts[0], own = parts[0].str.strip() + unit.map(_FACTORS).fillna(""), own[:0]
+        elif len(own) > 1 or (len(own) and mixed and re.match("[kMGTmµμunp][A-Za-z]*$", own[0])):
             raise ConfigurationError(
-                f"{source} is not allowed: its column {name!r} has units {own[:3].tolist()}"
+                f"{source} is not allowed: its column {name!r} has units "
+                f"{[*own[:3], *['none'] * mixed]}; write all its numbers in one unit"
             )
         units.append("".join(own))
-        read = {sign: _read(parts[0], sign) for sign in ".,"}
-        columns.append(
-            (parts[0], {s: v if factors is None else v * factors for s, v in read.items()})
-        )
+        columns.append((parts[0], {sign: _read(parts[0], sign) for sign in ".,"}))
         counts.append({sign: int(v.notna().sum()) for sign, v in columns[-1][1].items()})
     signs = {max(own, key=own.__getitem__) for own in counts if own["."] != own[","]}
     result = np.full(table.shape, np.nan)

@@ -63,9 +63,10 @@ class Recording:
 
         A column has the times. The head of every other column is the name of a channel, its unit in
         brackets and its limits: ``humidity [%] 0..100``; unit and limits may be left out. A file
-        with one row a reading has a column of times, of names and of values. An empty cell, a word
-        and an error code are no reading. Columns of words are left out. Times are rounded to
-        multiples of the channels' median interval.
+        with one row a reading has a column of times, of names and of values. Where columns such as
+        ``room`` or ``id`` name devices, each has its own channels. An empty cell, a word and an
+        error code are no reading. Columns of words are left out. Times are rounded to multiples of
+        the channels' median interval.
 
         Args:
             path: the file, which may be compressed, or the name of a shipped log: ``"tanks"`` or

@@ -26,6 +26,9 @@ class Drawn:
     truth: pd.DataFrame
     wrapped: str | None
     seconds: float
+    raw: bytes = b""
+    reasons: tuple[str, ...] = ()  # parts of right refusals
+    unreadable: bool = False
 
     def verdict(self, recording: Recording) -> str:
         """Return what is wrong with the recording, or an empty text."""
@@ -142,77 +145,112 @@ def draw_log(seed: int) -> Drawn:
     return Drawn(text, truth, wrapped, seconds)
 
 
-@dataclass
-class Strange(Drawn):
-    """A log as bytes, and a part of its refusal where none can read it."""
+STRANGE = ("%Y-%m-%d %H:%M:%S", "%d/%m/%Y %H:%M:%S", "%m/%d/%Y %H:%M:%S", "%d.%m.%Y %H:%M:%S",
+           "%a %d/%m/%Y %H:%M:%S", "%a, %m/%d/%Y %H:%M:%S", "%A %d %B %Y %H:%M:%S",
+           "%Y%m%d%H%M%S", "%Y%m%dT%H%M%S",
+           "%Y-%m-%d %I:%M:%S %p", "%d/%m/%Y %I:%M:%S")  # fmt: skip
+ZONES = {"": False, " UTC": False, " GMT": False, "+00:00": False, " CET": True}
+FOOTERS = (
+    "",
+    "",
+    "Total{0}12{0}1{0}2{0}3{0}4{0}5{0}6\n",
+    "# end\n",
+    "\nMean{0}12\n",
+    "End of file\n",
+)
 
-    content: bytes = b""
-    refusal: str | None = None
 
-
-STRANGE_CLOCKS = ("%Y-%m-%d %H:%M", "%d/%m/%Y %H:%M", "%m/%d/%Y %H:%M", "%a %d/%m/%Y %H:%M",
-                  "%d/%m/%Y %H:%M GMT", "%Y%m%d%H%M", "%d.%m.%Y %H:%M UTC", "24:00", "hours",
-                  "HrMn", "%d/%m/%Y %I:%M", "%d/%m/%Y %H:%M CET")  # fmt: skip
-ENCODINGS = "utf-8", "utf-8-sig", "cp1252", "utf-16"
-
-
-def draw_strange_log(seed: int) -> Strange:
-    """Return a log in a drawn format with weekdays, hours, footers, devices or suffixes."""
-    draw = np.random.default_rng(10_000 + seed)
-    rows, minutes = int(draw.integers(400, 1500)), int(draw.choice([30, 60]))
-    clock = str(draw.choice(STRANGE_CLOCKS))
-    minutes = 60 if clock in ("24:00", "hours", "HrMn") else minutes
-    first = pd.Timestamp("2023-01-01") + pd.Timedelta(int(draw.integers(0, 600)), "D")
-    times = pd.date_range(first, periods=rows, freq=f"{minutes}min")
-    devices = ("hall", "bath") if draw.random() < 0.25 else ("",)
-    count = int(draw.integers(1, 4))
-    path = draw.normal(size=(rows, count * len(devices)))
-    for row in range(1, rows):
-        path[row] += 0.9 * path[row - 1]
-    suffix = draw.random() < 0.2
-    values = np.round(900.0 + 100.0 * path if suffix else 20.0 + path, 1)
-    cells = values.astype(object)
-    if suffix:
-        large = values >= 1000.0
-        cells[large] = [f"{value / 1000.0:.4f}k" for value in values[large]]
-    elif draw.random() < 0.3:  # an error code
-        hit = draw.random(rows) < 0.02
-        hit[:: rows // 5] = True
-        cells[hit, 0], values[hit, 0] = float(draw.choice(CODES)), np.nan
-    names = [f"s{place}" for place in range(count)]
-    days = [time if time.hour else time - pd.Timedelta("1D") for time in times]
-    stamps = {"time": [time.strftime(clock) for time in times]}
+def draw_strange_log(seed: int) -> Drawn:
+    """Return a log with a drawn encoding, clock, footer, devices, error code and suffixes."""
+    draw = np.random.default_rng(seed)
+    form = str(draw.choice(STRANGE))
+    zone = str(draw.choice(list(ZONES), p=[0.7, 0.1, 0.1, 0.05, 0.05]))
+    zone = "" if form.startswith(("%Y%m", "%d/%m/%Y %I")) else zone
+    separator = str(draw.choice([",", ";", "\t", "|", "   "]))
+    encoding = str(draw.choice(["utf-8", "utf-8-sig", "cp1252", "utf-16"]))
+    clock = str(draw.choice(["one cell", "one cell", "24:00", "hours", "HrMn", "parts"]))
+    seconds, rows = float(draw.choice([600, 3600])), int(draw.integers(300, 900))
+    if clock in ("hours", "HrMn", "24:00"):  # whose hours are whole, of dates without a zone
+        form, zone = str(draw.choice(["%Y-%m-%d", "%d/%m/%Y", "%a %m/%d/%Y", "%Y%m%d"])), ""
+        seconds = 3600.0
+    start = pd.Timestamp("2023-01-01") + pd.Timedelta(int(draw.integers(0, 700 * 24)), "h")
+    times = start + pd.to_timedelta(np.arange(rows) * seconds, "s")
+    ends = np.array(times.hour == 0) & (clock in ("hours", "24:00")) & (draw.random() < 0.7)
+    days = times - pd.to_timedelta(ends.astype(int), "h")
+    hours = np.where(ends, 24, times.hour)
+    stamps = {"time": days.strftime(form) + zone}
     if clock == "24:00":
-        stamps = {
-            "time": [
-                f"{d:%d.%m.%Y} {t.hour or 24:02d}:00" for d, t in zip(days, times, strict=True)
-            ]
-        }
-    elif clock == "hours":
-        stamps = {"date": [f"{d:%Y-%m-%d}" for d in days], "hour": [t.hour or 24 for t in times]}
-    elif clock == "HrMn":
-        stamps = {"date": [f"{t:%Y%m%d}" for t in times], "HrMn": [t.hour * 100 for t in times]}
-    parts = []
-    for place, device in enumerate(devices):
-        own = cells[:, place * count : (place + 1) * count]
-        part = pd.DataFrame(stamps) if not device else pd.DataFrame(stamps).assign(room=device)
-        parts.append(part.assign(**dict(zip(names, own.T, strict=True))))
-    table = pd.concat(parts).sort_index(kind="stable") if len(parts) > 1 else parts[0]
-    separator = str(draw.choice([",", ";", "\t", "|", " "]))
-    if separator == " " and " " in str(table.iloc[0, 0]):
-        separator = ";"
-    text = table.to_csv(index=False, sep=separator)
-    head, body = text.split("\n", 1)
-    if draw.random() < 0.2 and separator != " ":  # a row of units
-        units = ["" for _ in [*stamps, *(["room"] if devices[0] else [])]] + ["°C"] * count
-        body = separator.join(units) + "\n" + body
-    if draw.random() < 0.2:
-        body += draw.choice(["# end of file\n", f"Total{separator}{rows}\n", "\n\n"])
-    if draw.random() < 0.1 and separator == ";":
-        head = f"sep=;\n{head}"
-    content = f"{head}\n{body}".encode(str(draw.choice(ENCODINGS)), "replace")
-    channels = [f"{name} {device}".strip() for device in devices for name in names]
-    channels = list(devices) if count == 1 < len(devices) else channels
-    refusal = {"%d/%m/%Y %I:%M": "from 1 to 12", "%d/%m/%Y %H:%M CET": "zone 'CET'"}.get(clock)
-    truth = pd.DataFrame(values, times, channels)
-    return Strange("", truth, None, 60.0 * minutes, content, refusal)
+        own = stamps["time"]
+        stamps = {"time": [f"{day} {hour:02}:00" for day, hour in zip(own, hours, strict=True)]}
+    elif clock in ("hours", "HrMn"):
+        factor = 100 if clock == "HrMn" else 1
+        own = [str(factor * hour) for hour in hours]
+        stamps = {"date": stamps["time"], "hour" if factor == 1 else "HrMn": own}
+        if draw.random() < 0.5 and factor > 1:
+            stamps["HrMn"] = [text.zfill(4) for text in own]
+    elif clock == "parts" and not zone and form[1:3] in ("d/", "m/", "Y-", "d."):
+        parts = [text.split(" ", 1) for text in stamps["time"]]
+        stamps = {"date": [p[0] for p in parts], "time": [p[1] for p in parts]}
+    if separator == "   ":  # whose cells have no space
+        if list(stamps) == ["time"] and not any(" " in text for text in stamps["time"]):
+            pass
+        elif list(stamps) == ["time"] or any(
+            " " in text for own in stamps.values() for text in own
+        ):
+            separator = ";"
+    devices = ["kitchen", "cellar"] if draw.random() < 0.25 else [""]
+    names, columns, readings = ["temp", "flow"], {}, {}
+    suffixed = draw.random() < 0.15
+    code = float(draw.choice(CODES)) if draw.random() < 0.25 else None
+    comma = separator != "," and draw.random() < 0.4
+    for name in names:
+        for device in devices:
+            path = np.zeros(rows)
+            for row in range(1, rows):
+                path[row] = 0.9 * path[row - 1] + draw.normal()
+            values = np.round(
+                (20.0 if name == "temp" else 980.0) + path * (5 * (name != "temp") + 1), 1
+            )
+            texts = [f"{value:.1f}" for value in values]
+            if name == "flow" and suffixed:
+                big = values > 1000.0
+                values = np.where(big, np.round(values / 10.0) * 10.0, values)
+                texts = [
+                    f"{v / 1000.0:.2f}k" if b else f"{v:.1f}"
+                    for v, b in zip(values, big, strict=True)
+                ]
+            if name == "temp" and code is not None:
+                hit = draw.random(rows) < 0.02
+                hit[:: rows // 5] = True
+                values[hit], texts = (
+                    np.nan,
+                    [f"{code:g}" if h else t for h, t in zip(hit, texts, strict=True)],
+                )
+            texts = [text.replace(".", ",") for text in texts] if comma else texts
+            columns[name, device] = texts
+            readings[f"{name} {device}".strip()] = values
+    key = str(draw.choice(["room", "location", "device"]))
+    frames = []
+    for device in devices:
+        own = {key: device} if device else {}
+        frames.append(pd.DataFrame({**stamps, **own, **{n: columns[n, device] for n in names}}))
+    table = pd.concat(frames).sort_index(kind="stable")
+    unit_row = draw.random() < 0.2 and separator != "   "
+    if any(separator in text for text in stamps.get("time", ())):
+        table["time"] = '"' + table["time"] + '"'
+    lines = [separator.join(row) for row in table.itertuples(index=False)]
+    heads = list(table)
+    top = [separator.join(heads)]
+    if unit_row:
+        units = {"temp": "°C", "flow": "l/h"}
+        top.append(separator.join(units.get(head, "") for head in heads))
+    if draw.random() < 0.15 and separator != "   ":
+        top.insert(0, f"sep={separator}")
+    footer = str(draw.choice(FOOTERS)).format(separator)
+    text = "\n".join([*top, *lines, ""]) + footer
+    truth = pd.DataFrame(readings, times)
+    halved = "%I" in form and "%p" not in form
+    reasons = ["may be day first or month first", "may be month first or day first"]
+    reasons += ["without AM and PM"] * halved + ["has the zone", "have the zone"] * ZONES[zone]
+    return Drawn(text, truth.dropna(how="all"), None, seconds, text.encode(encoding),
+                 tuple(reasons), halved or ZONES[zone])  # fmt: skip
