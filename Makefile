@@ -110,7 +110,7 @@ integrations-rejax: .venv-rejax/.installed  ## rejax
 integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
 
-benchmark: $(STAMP)  ## triggers, rules and learned policies of every class, 130 minutes: results/
+benchmark: $(STAMP)  ## triggers, rules and learned policies of every class, 150 minutes: results/
 	$(BIN)/python -m agents.benchmark
 
 papers: $(STAMP)  ## the five papers' figures, tables and claims: docs/reproduction/

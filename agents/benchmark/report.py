@@ -102,8 +102,8 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
         class_table(titles, results),
         "\n".join(f"- {text}" for text in sentences(results)),
         "## Two algorithms",
-        "Both with the same processor time, alone and calibrated with the searched rule. Seconds "
-        "of one training; cost over the best rule's, %.",
+        "Alone and calibrated with the searched rule. Seconds of a processor for one training; "
+        "cost over the best rule's, %.",
         comparison_table(titles, results),
         "## Rules of the literature" if named else "",
         table(

@@ -229,19 +229,19 @@ def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) ->
 
 @pytest.mark.usefixtures("few")
 def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
-    name = "zoo:tobit_oscillator_scheduler,calibrated=false"
+    name = "zoo:tobit_oscillator_centre,calibrated=false"
     command(name, tmp_path / "all.onnx")
-    command(f"{name},price=0.03", tmp_path / "one.onnx")
+    command(f"{name},price=0.1", tmp_path / "one.onnx")
     every, row = (onnxruntime.InferenceSession(str(tmp_path / f"{n}.onnx")) for n in ("all", "one"))
     about = describe(tmp_path / "one.onnx")
     assert "price" not in about["observation_names"]
-    assert about["fixed_price"] == pytest.approx(0.03)
+    assert about["fixed_price"] == pytest.approx(0.1)
     assert about["price_range"] is None
     task = fusion_gym.make_task(ENV, **zoo.card(name[4:-17])["training"]["environment"]["options"])
     rows = EpisodeBatch.seeded(task, 64, 0).observe()
     place = describe(tmp_path / "all.onnx")["observation_names"].index("price")
     low, high = describe(tmp_path / "all.onnx")["price_range"]
-    rows[:, place] = np.log(0.03 / low) / np.log(high / low)
+    rows[:, place] = np.log(0.1 / low) / np.log(high / low)
     first = every.run(["logits"], {"observation": rows})[0]
     second = row.run(["logits"], {"observation": np.delete(rows, place, axis=1)})[0]
     np.testing.assert_allclose(first, second, atol=1e-5)
