@@ -86,7 +86,7 @@ class Field(FitOptions, Long):
         inputs: Plain = {"log": joblib.hash(whole.values), "device": self.device}
         inputs |= {"tolerance": tolerance} if tolerance else {"target_rate": rate}
         inputs |= {"share": self.share, "channels": self.channels, "exact": self.exact}
-        inputs |= {"on_change": self.on_change}
+        inputs |= {"on_change": self.on_change, "units": [c.unit for c in recording.channels]}
         place = self.output / "study.json"
         if place.exists() and not self.resume:
             raise files.folder_refusal(self.output, "a study")
