@@ -126,17 +126,6 @@ class WindowNoise:
         """Number of windows."""
         return len(self.first)
 
-    @property
-    def readings(self) -> Array:
-        """Share of the steps of each window at which each sensor has a reading (count, l)."""
-        length = int(np.diff(self.first).min()) if self.count > 1 else len(self.rows)
-        sensors = self.rows.shape[1] - self.processes
-        known = np.isfinite(self.rows[:, self.processes :])
-        result: Array = np.array(
-            [known[first : first + length].mean(0) for first in self.first]
-        ).reshape(-1, sensors)
-        return result
-
     def window(self, seed: int, episode: int) -> int:
         """Return the window of an episode."""
         return (seed + _PRIME * episode) % self.count
