@@ -3,6 +3,7 @@
 import ast
 import functools
 import itertools
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,11 @@ def test_every_purpose_has_seeds_of_its_own() -> None:
             if isinstance(node, ast.Constant) and type(node.value) is int:
                 used = [r for r in ranges if r != seeds.TEST and node.value in r[: 10**9]]
                 assert not used or module == "fusion_gym.seeds", (module, node.value)
+
+
+def test_every_mutant_changes_one_place_and_names_tests_that_exist() -> None:
+    table = tomllib.loads((ROOT / "tests/mutants/mutants.toml").read_text(encoding="utf-8"))
+    for name, mutant in table.items():
+        assert (ROOT / mutant["file"]).read_text(encoding="utf-8").count(mutant["old"]) == 1, name
+        paths = [line.split(" -k ")[0].partition("::")[0] for line in mutant["tests"]]
+        assert all((ROOT / path).exists() for path in paths), name
