@@ -40,7 +40,7 @@ from fusion_gym.recordings.field_study import METHODS, PRACTICE, FieldStudy, Met
 from fusion_gym.recordings.recording import SHIPPED
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.run import holds_training, train
-from fusion_gym.validation import ConfigurationError, number, refusal
+from fusion_gym.validation import number, refusal
 
 AGENT = "agent"
 _WINDOWS, _LONGEST, _SHORTEST = 60, 300, 20  # windows at least, and steps of a window
@@ -94,11 +94,6 @@ class Field(FitOptions, Long):
             before = files.read_json(place, "output")
             files.check_inputs(inputs, before, f"the study in {str(self.output)!r}")
         plant = fit(recording, self.share, self.exact, order=1)  # a hold has no lags
-        if names := fitting.noisy_channels(plant):
-            raise ConfigurationError(
-                f"exact = False is not allowed with this log: {', '.join(names)} have measurement "
-                "noise, so their readings are no truth; give --exact if they are"
-            )
         values, rows = fitting.deviations(recording, self.share)
         complete = float(np.isfinite(values[:rows]).all(axis=1).mean())
         horizon = int(np.clip((len(values) - rows) // _WINDOWS, _SHORTEST, _LONGEST))

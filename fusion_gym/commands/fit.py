@@ -100,9 +100,9 @@ class Fit(FitOptions, Command):
         white = fitting.residual_correlations(plant, values[rows:])
         text = ", ".join(f"{name} {value:.2f} (lag {lag})" for name, lag, value in white)
         print(f"largest correlations of residuals in ten lags: {text}")
+        noise = zip(plant.names, plant.measurement_variance**0.5, strict=True)
+        print(f"measurement noise: {', '.join(f'{name} {value:.3g}' for name, value in noise)}")
         warnings = fitting.warnings_of(plant, values[rows:], criticism)
-        if names := fitting.noisy_channels(plant):
-            warnings.append(f"measurement noise of {', '.join(names)}: readings are no truth")
         warn((*recording.remarks, *plant.remarks, *warnings))
         writing(("option file", self.output))
         write_text(self.output, plant_text(plant, recording, self.log, rows))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import pickle
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
@@ -42,8 +43,8 @@ class RecordedFusionOptions(LinearFusionOptions):
     ``measurement``, ``held`` and ``expected_measurement`` are readings. A sensor without a reading
     cannot request. Errors of states without a reading count as zero.
 
-    ``fusion-gym fit`` writes the plant for ``system``. Fit with ``--exact``: a channel with
-    measurement noise is refused, because its reading is no truth.
+    ``fusion-gym fit`` writes the plant for ``system``. Without ``--exact`` it has measurement
+    noise, and the truth is drawn once, given the plant and all readings.
 
     The default is a made-up log of three tanks.
 
@@ -162,12 +163,13 @@ class ResampledNoise(PhiloxNoise):
 class _Part(NamedTuple):
     """The channels of a log.
 
-    Deviations (T, l), fitted rows, level (l, 5), times and step in days, and a millionth of the
-    resolutions (l,).
+    Deviations (T, l), normals of the measurement noise (T, l), NaN without a reading, fitted rows,
+    level (l, 5), times and step in days, and a millionth of the resolutions (l,).
     """
 
     names: tuple[str, ...]
-    values: Array
+    truth: Array
+    noise: Array
     rows: int
     level: Array
     day: Array
@@ -176,8 +178,10 @@ class _Part(NamedTuple):
 
 
 @functools.lru_cache(maxsize=4)
-def _part(log: str, modified: float, names: tuple[str, ...] | None, share: float) -> _Part:
-    """Read the channels of a log, which was modified at a time."""
+def _part(
+    log: str, modified: float, names: tuple[str, ...] | None, share: float, plant: bytes
+) -> _Part:
+    """Read the channels of a log, which was modified at a time, for a pickled plant."""
     from fusion_gym.recordings import Recording
     from fusion_gym.recordings.fitting import levels, words
 
@@ -191,13 +195,15 @@ def _part(log: str, modified: float, names: tuple[str, ...] | None, share: float
     times = np.asarray((index - index.normalize()).total_seconds()) / day
     quantum = np.array([1e-6 * (row.resolution or 1.0) for row in recording.card])
     step = recording.interval.total_seconds() / day
-    return _Part(names, values, rows, level, times, step, quantum)
+    fitted = pickle.loads(plant)
+    path = fitted.truth(values)
+    noise = (values - path) / np.sqrt(fitted.measurement_variance)
+    return _Part(names, path, noise, rows, level, times, step, quantum)
 
 
 def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     """Return the scenario of these options."""
     from fusion_gym.recordings import FittedPlant
-    from fusion_gym.recordings.fitting import noisy_channels
 
     if choice.input_matrix is not None:
         reason = "what was recorded follows no other input"
@@ -218,19 +224,14 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
     count, order = truth.sensor_count, plant.size // truth.sensor_count
     names = None if choice.state_names is None else truth.state_names[:count]
     modified = os.path.getmtime(choice.log) if os.path.exists(choice.log) else 0.0
-    part = _part(choice.log, modified, names, share)
     matrix = truth.sensors.measurement_matrix[:, 0, :, 0]
     if not np.array_equal(matrix, np.eye(count, count * order)):
         raise refusal("measurement_matrices", matrix, "rows of the identity, one for each channel")
-    variance = truth.sensors.variance[:, 0, 0]
     fitted = FittedPlant(
-        part.names, plant.transition[..., 0], plant.process_covariance[..., 0], variance, order
-    )
-    if noisy := noisy_channels(fitted):
-        raise refusal(
-            "measurement_covariances", variance, f"those of exact readings: the noise of "
-            f"{', '.join(noisy)} makes a reading no truth; fit with --exact if it is one"
-        )  # fmt: skip
+        names or (), plant.transition[..., 0], plant.process_covariance[..., 0],
+        truth.sensors.variance[:, 0, 0], order,
+    )  # fmt: skip
+    part = _part(choice.log, modified, names, share, pickle.dumps(fitted))
     noise = {
         "normal": lambda: None,
         "resampled": lambda: ResampledNoise(_residuals(plant, part)),
@@ -291,10 +292,10 @@ def _states(values: Array, order: int) -> Array:
 
 def _residuals(plant: LinearPlant, part: _Part) -> Array:
     """Return the process noises (K, r) between complete steps of the fitted part."""
-    values, count = part.values[: part.rows], len(part.names)
+    count = len(part.names)
     order = plant.size // count
-    noise = _noises(plant, _states(values, order), count)
-    known: Any = np.isfinite(values).all(axis=1)
+    noise = _noises(plant, _states(part.truth[: part.rows], order), count)
+    known: Any = np.isfinite(part.noise[: part.rows]).all(axis=1)
     complete: Any = np.all(
         [known[order - lag : len(known) - lag] for lag in range(order + 1)], axis=0
     )
@@ -309,11 +310,11 @@ def _residuals(plant: LinearPlant, part: _Part) -> Array:
 
 def _windows(plant: LinearPlant, part: _Part, horizon: int, rows: slice) -> WindowNoise:
     """Return the windows of some rows."""
-    values, count = part.values, len(part.names)
+    count = len(part.names)
     order = plant.size // count
-    path, known = _states(values, order)[rows], np.isfinite(values[rows])
-    gaps = np.where(known, 0.0, np.nan)
-    steps = np.hstack([_noises(plant, path, count), gaps[1:]])
+    path, own = _states(part.truth, order)[rows], part.noise[rows]
+    known = np.isfinite(own)
+    steps = np.hstack([_noises(plant, path, count), own[1:]])
     starts = np.arange(order - 1, len(path) - horizon - 1, horizon + 1)
     present = np.array([known[first : first + horizon + 1].mean() for first in starts])
     starts = starts[present >= _READINGS * known.mean()]
@@ -323,5 +324,5 @@ def _windows(plant: LinearPlant, part: _Part, horizon: int, rows: slice) -> Wind
     root = plant.initial_factor[..., 0]
     moved = (path[starts] - plant.initial_mean[:, 0]) @ np.linalg.pinv(root).T
     still, day = np.zeros_like(moved), part.day[rows][starts, None]
-    start = np.hstack([still, moved, gaps[starts], day])
+    start = np.hstack([still, moved, own[starts], day])
     return WindowNoise(start, steps, starts, plant.noise_channels)

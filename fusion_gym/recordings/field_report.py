@@ -235,7 +235,8 @@ def write_report(report: FieldReport, folder: Path) -> str:
     summary = [
         f"## At {target}",
         f"Settings, packets and errors of a sensor are those of {study.lengths[1]:,} steps in one "
-        f"piece, which were not fitted; curves are means of {windows} windows.",
+        f"piece, which were not fitted; curves are means of {windows} windows. Errors are those of "
+        "the channels without measurement noise.",
         *(_tolerance_lines(report) if study.tolerance else _rate_lines(report)),
         device_table(report),
         *([] if report.device is None else [f"{report.device}: {DEVICES[report.device][2]}"]),

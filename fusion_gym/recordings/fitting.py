@@ -20,7 +20,7 @@ from fusion_gym.validation import integer, number
 
 RATES = 0.3, 0.2, 0.1, 0.05, 0.02
 RATIOS = 0.8, 1.25  # real over model error without a warning
-NOISY = 0.25  # measurement variance over process variance of a channel whose truth is unknown
+_NOISY = 1e-4  # measurement variance over process variance of a channel whose truth is unknown
 _TARGET = 0.05  # rate at which the held-out error chooses the order
 _CLOSE = 1.02  # an order is good enough if its error is at most this times the least
 _ORDERS = 1, 2  # a lag adds a state for each channel
@@ -119,6 +119,34 @@ class FittedPlant:
         model["state_cov"] = self.process_covariance
         model.initialize_known(np.zeros(size), self.stationary_covariance)
         return model.smooth() if smooth else model.filter()
+
+    def truth(self, deviations: Array, seed: int = 0) -> Array:
+        """Return deviations without measurement noise, drawn given all readings.
+
+        The mean squared error of an estimate that depends on the readings alone is then the error
+        that the plant predicts. Without measurement noise a reading is the truth.
+
+        Args:
+            deviations: deviations (T, channels), NaN where there is no reading.
+            seed: seed of the draw.
+
+        Returns:
+            The deviations (T, channels).
+
+        Source: J. Durbin and S. J. Koopman, "A simple and efficient simulation smoother for state
+        space time series analysis", Biometrika 89, 2002.
+        """
+        count, noise = len(self.names), self.measurement_variance
+        if (noise <= _NOISY * np.diagonal(self.process_covariance)[:count]).all():
+            return deviations
+        draw, size = np.random.default_rng(seed), len(self.transition)
+        path = draw.multivariate_normal(np.zeros(size), self.process_covariance, len(deviations))
+        path[0] = draw.multivariate_normal(np.zeros(size), self.stationary_covariance)
+        for row in range(1, len(path)):
+            path[row] += self.transition @ path[row - 1]
+        own = path[:, :count] + np.sqrt(noise) * draw.normal(size=deviations.shape)
+        result = self.filter(deviations - own, smooth=True)
+        return np.asarray(path[:, :count] + result.smoothed_state[:count].T, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -286,13 +314,13 @@ def criticise(
         [0.5, 0.1]
     """
     count, rows = values.shape[1], []
-    scale = np.diagonal(plant.stationary_covariance)[:count]
+    scale, truth = np.diagonal(plant.stationary_covariance)[:count], plant.truth(values)
     for rate in rates:
         period = round(1.0 / rate)
         turn = np.arange(len(values))[:, None] + (np.arange(count) * period) // count
         sent = turn % period == 0
         result = plant.filter(np.where(sent, values, np.nan))
-        error = values - result.filtered_state[:count].T
+        error = truth - result.filtered_state[:count].T
         claimed = result.filtered_state_cov[:count, :count]
         known = np.isfinite(values)
         variance = np.diagonal(claimed).clip(0.0)
@@ -314,13 +342,6 @@ def warnings_of(plant: FittedPlant, values: Array, rows: Sequence[Criticism]) ->
         if abs(value) > _CORRELATION:
             result.append(f"residuals of {name} are not white: correlation {value:.2f}, lag {lag}")
     return result
-
-
-def noisy_channels(plant: FittedPlant) -> list[str]:
-    """Return the channels whose measurement noise is too large for readings as the truth."""
-    process = np.diagonal(plant.process_covariance)
-    pairs = zip(plant.names, plant.measurement_variance, process, strict=False)
-    return [name for name, noise, own in pairs if noise > NOISY * own]
 
 
 def residual_correlations(plant: FittedPlant, values: Array) -> Iterator[tuple[str, int, float]]:

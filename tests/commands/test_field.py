@@ -98,9 +98,9 @@ def sent_on_change(readings: Any, thresholds: Any, most: int) -> tuple[Any, Any]
     return np.array(sent), np.array(lasts)
 
 
-def errors_of_stream(task: Any, sent: Any) -> Any:
-    """Errors (T, l) of a centre that predicts, observes and updates; NaN without a reading."""
-    centre, noise, plant, errors = task.estimator, task.noise, task.plant, []
+def estimates_of_stream(task: Any, sent: Any) -> Any:
+    """Readings (T, l) that a centre expects, which predicts, observes and updates."""
+    centre, noise, plant, estimates = task.estimator, task.noise, task.plant, []
     known, day = plant.start(noise.start(0, 0, plant.start_channels)[:, None])
     state = centre.start(plant.measurement(known), day)
     for step, sends in enumerate(sent):
@@ -111,8 +111,9 @@ def errors_of_stream(task: Any, sent: Any) -> Any:
         state = centre.observe(centre.predict(state), packets)
         possible = np.isfinite(reading[:, 0])
         state = centre.update(state, Reception(sends[:, None], possible))
-        errors.append(np.where(possible, known.truth - state.mean, np.nan)[:, 0])
-    return np.array(errors)
+        level = centre.level.at(state.day, np.full(1, step + 1.0))
+        estimates.append((state.mean + level[:, 0])[:, 0])
+    return np.array(estimates)
 
 
 @pytest.mark.parametrize("log", ["tanks", "mast", 0, 1, 2])
@@ -139,11 +140,11 @@ def test_what_is_reported_is_one_replay_of_the_other_part(
     readings = pd.concat([first, recording.values.iloc[rows + 1 : -1]]).to_numpy()
     sent, last = sent_on_change(readings, thresholds, study.max_interval)
     if filter_name == "hold":
-        squares = (readings[1:] - last) ** 2
+        estimates = last
     else:
         task = study.task(filter_name, "recorded", **options, horizon=len(sent))
-        squares = errors_of_stream(task, sent) ** 2
-    errors = np.sqrt(np.nanmean(squares, axis=0))
+        estimates = estimates_of_stream(task, sent)
+    errors = np.sqrt(np.nanmean((readings[1:] - estimates) ** 2, axis=0))
     assert len(result.rates) == 1
     np.testing.assert_allclose(result.rates[0], sent.mean(0), rtol=0, atol=1e-12)
     np.testing.assert_allclose(result.deviations, errors, rtol=1e-6)
@@ -162,10 +163,11 @@ def room(small_studies: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return [str(tmp_path / "room.csv"), "--output", str(tmp_path / "field"), *ROOM]
 
 
-def write_room(file: Path, noise: float = 0.0, rows: int = 2400) -> None:
+def write_room(file: Path, noise: float = 0.0, rows: int = 2400, late: float = 1.0) -> None:
+    """Two channels with measurement noise; ``late`` scales the process noise of the last 40 %."""
     draw, path = np.random.default_rng(0).normal(size=(2, rows, 2)), np.zeros((rows, 2))
     for row in range(1, rows):
-        change = draw[0, row] * [0.4, 2.0] * (1.0 if row < 0.6 * rows else 2.0)
+        change = draw[0, row] * [0.4, 2.0] * (1.0 if row < 0.6 * rows else late)
         path[row] = 0.95 * path[row - 1] + change
     path += noise * draw[1] * [0.4, 2.0] + [20.0, 50.0]
     index = pd.date_range("2026-01-01", periods=rows, freq="10min", name="time")
@@ -178,6 +180,7 @@ def test_the_least_packets_keep_the_tolerance_with_what_a_device_holds(
 ) -> None:
     """On the fitted part; thresholds a tenth larger exceed it. The other part is replayed."""
     monkeypatch.setattr(field_study, "_CLOSE", 0.05)
+    write_room(tmp_path / "room.csv", late=2.0)
     words = [*room, "--tolerance", "air=0.3", "damp=1.5", "--device", "zigbee"]
     printed = succeed("field", words).out
     settings = yaml.safe_load((tmp_path / "field" / "devices.yaml").read_text())
@@ -311,9 +314,39 @@ def test_fields_of_devices() -> None:
     assert filters == [{"throttle": "60s"}, {"or": [{"heartbeat": "6000s"}, {"delta": 0.25}]}]
 
 
-def test_a_channel_with_noise_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    write_room(tmp_path / "log.csv", noise=2.0)
-    output = tmp_path / "field"
-    error = refusal("field", [str(tmp_path / "log.csv"), "--output", str(output)])
-    assert "give --exact if they are" in error
-    assert not output.exists()
+@pytest.mark.slow
+def test_a_log_with_noise_is_studied_without_further_options(
+    room: list[str], tmp_path: Path
+) -> None:
+    write_room(tmp_path / "room.csv", noise=1.0)
+    printed = succeed("field", [word for word in room if word != "--exact"]).out
+    assert "## Recommendation" in printed
+    assert (tmp_path / "field" / "devices.yaml").exists()
+
+
+@pytest.mark.parametrize("method", [PRACTICE, "silence ignored, one a sensor", "silence used"])
+def test_errors_of_a_log_with_noise_are_those_of_the_quantity(method: str, tmp_path: Path) -> None:
+    """Which the test knows; the noise is as large as the process noise."""
+    noisy, true = tmp_path / "log.csv", tmp_path / "true.csv"
+    write_room(noisy, noise=1.0, rows=6000)
+    write_room(true, rows=6000)
+    recording, rows = Recording.read(noisy).select(), 3000
+    plant = fit(recording, order=1)
+    assert plant.measurement_variance**0.5 == pytest.approx([0.4, 2.0], rel=0.15)
+    study = FieldStudy(
+        plant.options | {"log": str(noisy)}, 0.05, plant.typical_changes, 50, "normal",
+        lengths=(rows, rows),
+    )  # fmt: skip
+    thresholds = study.quantize(1.5 * np.array(plant.typical_changes))
+    filter_name, (options, rule) = METHODS[method][0], rule_of(study, method, thresholds)
+    result = replay_whole(study, filter_name, options, rule)
+    readings = recording.values.to_numpy()[rows:-1]
+    truth = Recording.read(true).values.to_numpy()[rows + 1 : -1]
+    sent, estimate = sent_on_change(readings, thresholds, study.max_interval)
+    assert 0.02 < sent.mean() < 0.3
+    if filter_name != "hold":
+        task = study.task(filter_name, "recorded", **options, horizon=len(sent))
+        estimate = estimates_of_stream(task, sent)
+    errors = np.sqrt(((estimate - truth) ** 2).mean(0))
+    np.testing.assert_allclose(result.rates[0], sent.mean(0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(result.deviations, errors, rtol=0.05)

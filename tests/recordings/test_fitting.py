@@ -1,5 +1,6 @@
 """Plants fitted to logs of known plants, and their criticism."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from fusion_gym.recordings.fitting import (
     RATES,
     RATIOS,
     deviations,
-    noisy_channels,
     residual_correlations,
     warnings_of,
 )
@@ -184,7 +184,6 @@ def test_a_channel_with_measurement_noise_is_named() -> None:
     path = simulate(6000)
     path[:, 1] += np.random.default_rng(2).normal(0.0, 1.5, 6000)
     plant = fit(recording(path))
-    assert noisy_channels(plant) == ["c1"]
     assert plant.measurement_variance[1] == pytest.approx(2.25, rel=0.2)
 
 
@@ -260,7 +259,7 @@ def test_exact_readings_in_coarse_steps_have_no_noise() -> None:
     assert (np.diff(path, axis=0) == 0.0).mean() > 0.5
     plant = fit(recording(path), exact=True)
     assert plant.measurement_variance == pytest.approx(1e-10 * path[:4000].var(), rel=1e-9)
-    assert noisy_channels(plant) == []
+    assert plant.truth(path) is path
 
 
 def test_an_alarm_that_begins_late_is_fitted() -> None:
@@ -330,3 +329,21 @@ def test_a_channel_in_another_unit_repeats_the_first(slope: float) -> None:
     first, other = np.round(20.0 + 5.0 * simulate(900)[:, :2], 1).T
     path = np.column_stack([first, np.round(32.0 + slope * first, 0 if slope > 1.0 else 1), other])
     assert [row.fault for row in recording(path).card] == ["", "repeats c0", ""]
+
+
+def test_the_truth_of_noisy_readings_has_the_moments_of_the_smoother() -> None:
+    """2,000 draws of 40 steps with gaps; exact readings are the truth."""
+    noise = np.array([0.3, 0.05])
+    plant = FittedPlant(("a", "b"), A[:2, :2], W[:2, :2], noise, 1)
+    readings = np.random.default_rng(0).normal(size=(40, 2))
+    readings[5:9, 0] = np.nan
+    draws = np.stack([plant.truth(readings, seed) for seed in range(2000)])
+    result = plant.filter(readings, smooth=True)
+    covariance = result.smoothed_state_cov
+    deviation = np.sqrt(np.diagonal(covariance))
+    assert np.abs((draws.mean(0) - result.smoothed_state.T) / deviation).max() < 5 / np.sqrt(2000)
+    assert np.abs(draws.var(0) / deviation**2 - 1.0).max() < 5 * np.sqrt(2 / 2000)
+    neighbours = np.cov(draws[:, 20, 0], draws[:, 21, 0])[0, 1]
+    assert neighbours == pytest.approx(result.smoothed_state_autocov[0, 0, 20], rel=0.2)
+    exact = replace(plant, measurement_variance=np.full(2, 1e-9))
+    assert exact.truth(readings) is readings

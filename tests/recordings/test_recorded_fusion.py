@@ -260,7 +260,6 @@ def test_resampled_noises_are_rows_of_residuals() -> None:
 
 def test_what_is_no_recording_of_the_plant_is_refused(log: str) -> None:
     cases: list[tuple[dict[str, Any], str]] = [
-        ({"measurement_covariances": [1.0, 1.0]}, "fit with --exact if it is one"),
         ({"state_names": ["a", "z"]}, "state_names = .* channels of a, b"),
         ({"measurement_matrices": [[0.0, 1.0], [1.0, 0.0]]}, "rows of the identity"),
         ({"process_covariance": [[1.0, 1.0], [1.0, 1.0]]}, "process noise of its own"),
