@@ -146,7 +146,10 @@ NETWORKS: dict[str, list[Options]] = {
         PAIRS | {"channel": "gilbert_elliott", "delay": (0, 1)} | SCARCE,
         {"schedule": VARYING, "memory": True, "access": "any"} | SCARCE,
         {"schedule": VARYING | {"end": "hold"}, "delay": (0, 2), "fusion": "sci"} | NOISY,
+        {"filter": "local", "channel": "independent", "acknowledgements": "none"},
+        {"filter": "local", "memory": True, "budget": "sensor", "delay": 1} | SCARCE,
     ],
+    "RecordedFusion": [{"filter": "local", "memory": True, "budget": "sensor"} | SCARCE],
     "TobitOscillator": [{"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE],
     "MarkovJumpTracking": [{"channel": "independent", "acknowledgements": 0.4}],
     "UnknownInput": [

@@ -25,6 +25,7 @@ from fusion_gym.systems.tobit.filters import (
     NodeFilter,
     StochasticEventFilter,
     joint_update,
+    linear_update,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
@@ -38,14 +39,27 @@ _ROUNDS = 2  # a third changes errors by less than a thousandth
 _LEAST_SHARE = 1e-9  # of a variance; the rest of the difference is rounding
 
 
+class Nodes(NamedTuple):
+    """What sensors without feedback predict from their own deliveries.
+
+    ``mean`` (sensors, n, N) and ``covariance`` (sensors, n, n, N) of the state, ``value`` and
+    ``deviation`` (sensors, m, N) of the measurement.
+    """
+
+    mean: Array
+    covariance: Array
+    value: Array
+    deviation: Array
+
+
 class Prediction(NamedTuple):
     """The prediction of centre and nodes before a transmission.
 
     ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
     (n, n, N) of the covariance without a transmission, the centre's ``prior``, and, where nodes
     have covariances of their own, their ``outcomes`` z of x = x̂ + G z. A centre that uses held
-    values has them as ``held``, a hold its ``moment``; ``possible`` (sensors, N) are the sensors
-    that the network would have granted, ``None`` for all.
+    values has them as ``held``, a hold its ``moment``, sensors without feedback their ``nodes``;
+    ``possible`` (sensors, N) are the sensors that the network would have granted, ``None`` for all.
     """
 
     expectation: Expectation
@@ -55,7 +69,15 @@ class Prediction(NamedTuple):
     outcomes: Any = None
     held: Any = None
     moment: Any = None
+    nodes: Nodes | None = None
     possible: Any = None
+
+    @property
+    def own(self) -> tuple[Array, Array]:
+        """Expectation and deviation of the measurements, as the sensors know them."""
+        if self.nodes is not None:
+            return self.nodes.value, self.nodes.deviation
+        return self.expectation.value, self.deviation
 
 
 class Centre(Protocol):
@@ -414,12 +436,15 @@ class JointCentre(FederatedCentre):
     local_means = Centre.local_means
 
 
-def joint_centre(options: Any, sensors: CensoredSensors) -> JointCentre:
-    """Return the centre of ``filter="joint"``.
+def joint_centre(
+    options: Any, sensors: CensoredSensors, kind: type[JointCentre] = JointCentre
+) -> JointCentre:
+    """Return the centre of ``filter="joint"`` or ``"local"``.
 
     Args:
         options: options of the environment, of which none matters.
         sensors: the sensors.
+        kind: class of the centre.
 
     Raises:
         ConfigurationError: more than 100 channels.
@@ -427,11 +452,58 @@ def joint_centre(options: Any, sensors: CensoredSensors) -> JointCentre:
     channels = sensors.noise_channels
     if channels > _MOST_CHANNELS:
         raise ConfigurationError(
-            f"filter = 'joint' is not allowed with {sensors.count} sensors of {sensors.size} "
-            f"channels: together they may have at most {_MOST_CHANNELS}, because a step costs "
+            f"filter = {options.filter!r} is not allowed with {sensors.count} sensors of "
+            f"{sensors.size} channels: together they may have at most {_MOST_CHANNELS}, because a step costs "
             "their cube; with independent noises 'kalman' is the same filter"
         )
-    return JointCentre(KalmanFilter(sensors), np.ones((sensors.count, 1)))
+    return kind(KalmanFilter(sensors), np.ones((sensors.count, 1)))
+
+
+@dataclass(frozen=True)
+class LocalCentre(JointCentre):
+    r"""Kalman filter of all deliveries at the centre, and one of its own deliveries at each sensor.
+
+    The centre sends nothing back, so a sensor can compute its innovation alone.
+
+    Equation:
+        $$
+        \text{delivered:}\quad \hat x_i^{+}=\hat x_i+K_i(y_i-C_i\hat x_i),\qquad
+        \text{else:}\quad \hat x_i^{+}=\hat x_i,\qquad \hat x_i'=A\hat x_i^{+}
+        $$
+
+        K_i is the gain of sensor i alone; its innovation has the variance C_i P_i C_iᵀ + R_i.
+
+    Assumes: what :class:`JointCentre` assumes.
+
+    Source: B. D. O. Anderson and J. B. Moore, "Optimal Filtering", 1979, chapter 3.
+    """
+
+    traceable = False
+
+    def advance(self, model: LinearPlant, state: Any, control: Array | None) -> Prediction:
+        """See :class:`Centre`; an estimate of a sensor begins at the plant's."""
+        result = super().advance(model, state, control)
+        if state.prediction is None:
+            shape = (self.sensors.count, model.size, state.time.size)
+            mean = np.broadcast_to(model.initial_mean, shape)
+            covariance = np.broadcast_to(model.initial_covariance, (*shape[:2], *shape[1:]))
+        else:
+            mean, covariance = state.prediction.nodes[:2]
+        arrived = state.age == 0.0
+        if state.available is not None:
+            arrived = arrived & state.available
+        matrix, variance = self.sensors.measurement_matrix, self.sensors.variance
+        root = linalg.root(covariance)
+        correction, posterior = linear_update(linalg.matmul(matrix, root), variance)
+        innovation = state.measurement - linalg.matvec(matrix, mean)
+        shift = linalg.matvec(linalg.transpose(correction), innovation)
+        mean = mean + arrived[:, None] * linalg.matvec(root, shift)
+        posterior = linalg.congruence(root, posterior)
+        covariance = np.where(arrived[:, None, None], posterior, covariance)
+        mean, covariance = model.predict(mean, covariance, control)
+        spread = linalg.diagonal(linalg.congruence(matrix, covariance))
+        value, deviation = linalg.matvec(matrix, mean), np.sqrt(spread + variance)
+        return result._replace(nodes=Nodes(mean, covariance, value, deviation))
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -37,6 +38,9 @@ _FILTERS = {
     "adf": centres.FILTERS["adf"],
     "stochastic": centres.FILTERS["stochastic"],
     "joint": centres.Filter(centres.JointCentre, centres.joint_centre),
+    "local": centres.Filter(
+        centres.LocalCentre, partial(centres.joint_centre, kind=centres.LocalCentre)
+    ),
     "hold": centres.Filter(
         centres.HoldCentre,
         lambda options, sensors: centres.hold_centre(sensors, _system(options)[0]),
@@ -120,9 +124,10 @@ class LinearFusionOptions(system.FeedbackOptions):
     token_rate: ArrayLike = 1.0
     token_capacity: ArrayLike = 15.0
     initial_tokens: ArrayLike = 6.0
-    filter: Annotated[str | None, _FILTERS, NumpyOnly("hold", "truncated")] = None
+    filter: Annotated[str | None, _FILTERS, NumpyOnly("hold", "local", "truncated")] = None
     """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
-    ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
+    ``"joint"``, one Kalman filter at the centre. ``"local"`` is that filter without feedback: a
+    sensor predicts from its own deliveries. With censored sensors the default is ``"adf"``, one
     assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
     is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the state that fits the
     last delivered values best, weighted by their noises, without a filter. ``"truncated"`` is one
@@ -295,8 +300,8 @@ def _check_rules(options: LinearFusionOptions) -> None:
     why = "because the sensors' noises are correlated"
     for name in ("filter", "memory_filter"):
         kind = getattr(options, name)
-        if kind not in (None, "joint", "kalman"):
-            raise validation.refusal(name, kind, f"'joint' or 'kalman', {why}")
+        if kind not in (None, "joint", "local", "kalman"):
+            raise validation.refusal(name, kind, f"'joint', 'local' or 'kalman', {why}")
         if kind == "kalman" and options.fusion not in ("ci", "sci"):
             allowed = f"'ci' or 'sci' with {name}='kalman', {why}"
             raise validation.refusal("fusion", options.fusion, allowed)

@@ -33,6 +33,7 @@ from fusion_gym.systems.tobit.centres import (
     Centre,
     Filter,
     HoldCentre,
+    LocalCentre,
     NodeCentre,
     Prediction,
 )
@@ -218,6 +219,11 @@ class CensoredEstimator(
         return self.centre.traceable
 
     @property
+    def independent_nodes(self) -> bool:  # type: ignore[override]
+        """See :class:`Estimator`."""
+        return isinstance(self.centre, LocalCentre)
+
+    @property
     def reads_silence(self) -> bool:  # type: ignore[override]
         """See :class:`Estimator`."""
         return self.centre.reads_silence
@@ -298,11 +304,18 @@ class CensoredEstimator(
         at_threshold = "whether the component is at its threshold"
         uncensored = "predicted probability that the component is not censored"
         divisor, unit = 2.0 * sensors.deviation, "two noise deviations"
+        level: dict[str, Any] = {}
         if self.level is not None:  # exact readings
+            level = {"level": self.level.waves, "days a step": self.level.step}
             divisor, unit = self.scale[: sensors.count, None, None], "the state's root mean square"
         moved = f"new minus last delivered measurement, over {unit}"
         blocks = [
-            new("whitened_innovation", "innovation over its predicted deviation", _whitened),
+            new(
+                "whitened_innovation",
+                "innovation over its predicted deviation",
+                _whitened,
+                constants=level,
+            ),
             new("censored", at_threshold, lambda s: sensors.censored(s.measurement), limit=None),
             new(
                 "held_difference",
@@ -321,6 +334,8 @@ class CensoredEstimator(
         ]
         if sensors.unlimited:  # these two would say nothing
             blocks = [block for block in blocks if block.name not in _OF_CENSORING]
+        if self.independent_nodes:
+            blocks[-2:] = (replace(block, node="hidden") for block in blocks[-2:])
         return tuple(blocks)
 
     def start(self, measurement: Array, announcement: Any) -> CensoredEstimate:
@@ -366,7 +381,7 @@ class CensoredEstimator(
         if self.level is None:
             return super().observe(state, measurement)
         available = np.isfinite(measurement[:, 0])
-        expected = sensed(state.prediction).expectation.value
+        expected = sensed(state.prediction).own[0]
         filled = np.where(available[:, None], measurement, expected)
         return replace(state, measurement=filled, available=available)
 
@@ -398,7 +413,8 @@ class CensoredEstimator(
 
     def read(self, state: CensoredEstimate, failure: Array | None = None) -> SignalValues:
         """Return the signals of ``SIGNALS``."""
-        expectation, deviation = sensed(state.prediction)[:2]
+        expectation = sensed(state.prediction).expectation
+        expected, deviation = sensed(state.prediction).own
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
@@ -407,9 +423,9 @@ class CensoredEstimator(
 
         values: dict[str, Any] = {
             **super().read(state, failure),
-            "innovation": lambda: state.measurement - expectation.value,
+            "innovation": lambda: state.measurement - expected,
             "censored": lambda: self.centre.sensors.censored(state.measurement),
-            "expected_measurement": expectation.value,
+            "expected_measurement": expected,
             "innovation_deviation": deviation,
             "uncensored_probability": expectation.uncensored_probability,
             "silent_variance": lambda: variances()[0],
@@ -422,7 +438,7 @@ class CensoredEstimator(
             **values,
             "measurement": self.level.reading(state.measurement, level),
             "held": self.level.reading(state.held, level),
-            "expected_measurement": expectation.value + level,
+            "expected_measurement": expected + level,
             "sampled": available,
             "variance_reduction": lambda: np.where(available, variances()[1], 0.0),
         }
@@ -447,8 +463,8 @@ class CensoredEstimator(
 
 
 def _whitened(state: CensoredEstimate) -> Array:
-    expectation, deviation = sensed(state.prediction)[:2]
-    return (state.measurement - expectation.value) / deviation
+    expected, deviation = sensed(state.prediction).own
+    return (state.measurement - expected) / deviation
 
 
 @dataclass(frozen=True)
@@ -547,7 +563,7 @@ def feedback_scenario(
         estimator,
         controller=controller,
         policy_defaults=defaults,
-        feedback=True,
+        feedback=not estimator.independent_nodes,
         memory_estimator=memory,
         **others,
     )
