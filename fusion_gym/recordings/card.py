@@ -10,13 +10,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.recordings.reading import run_lengths
+from fusion_gym.recordings.reading import reported_change, run_lengths
 
 _SATURATED = 0.01  # share of readings at an extreme value that is a limit
 _STUCK = 12  # equal readings in a row, at least, of a channel that is stuck
 _SPIKE = 12.0  # robust deviations of the changes between readings
 _AGREEMENT, _FAULTY = 0.95, 0.9  # correlations with the median of the peers
-_SIZE, _GAPS = 0.35, 0.2  # least over median change of a log on change, and its share of gaps
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,8 @@ def _card(column: pd.Series, channel: RecordedChannel, agreement: float) -> Chan
     jumps = np.minimum(size[1:], size[:-1]) * (changes[1:] * changes[:-1] < 0.0)
     faults = {"constant": len(distinct) == 1, "stuck": stuck > 0.5, "counts": _counts_up(values),
               "wraps around": _wraps(values)}  # fmt: skip
-    every = float(np.median(np.diff(np.flatnonzero(column.notna())))) if changes.size else 0.0
+    places = np.flatnonzero(column.notna())
+    every = float(np.median(np.diff(places))) if changes.size else 0.0
     several = len(distinct) > 1
     return ChannelCard(
         channel=channel, readings=len(values), missing=1.0 - len(values) / len(column),
@@ -122,7 +122,7 @@ def _card(column: pd.Series, channel: RecordedChannel, agreement: float) -> Chan
         saturated=float(saturated.mean()) if several else 0.0, stuck=stuck,
         spikes=int((jumps > _SPIKE * usual).sum()), agreement=agreement,
         fault=next((fault for fault, true in faults.items() if true), ""),
-        change=_reported_change(column.to_numpy()),
+        change=reported_change(places, values),
     )  # fmt: skip
 
 
@@ -166,21 +166,6 @@ def _counts_up(values: Array) -> bool:
     restarts = values[1:][falls] <= values.min() + 0.05 * np.ptp(values)
     never = len(changes) >= 100 and falls.mean() <= 0.01 and bool(restarts.all())
     return bool(equal or never)
-
-
-def _reported_change(values: Array) -> float:
-    """Return the size that all changes between readings (T,) have, zero if any may occur.
-
-    The gaps of a log recorded on change end in a change of at least one size. A gap of the longest
-    time may end in a smaller one.
-    """
-    places = np.flatnonzero(np.isfinite(values))
-    gaps, changes = np.diff(places), np.abs(np.diff(values[places]))
-    if len(gaps) < 30 or np.mean(gaps > 1) < _GAPS or gaps.min() == gaps.max():
-        return 0.0
-    own = changes[gaps < gaps.max()] if np.mean(gaps == gaps.max()) > 0.02 else changes
-    size, middle = np.quantile(own, (0.02, 0.5)) if len(own) >= 30 else (0.0, 1.0)
-    return float(size) if size > _SIZE * middle else 0.0
 
 
 def _copies(values: pd.DataFrame) -> dict[str, str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from pandas.io.common import get_handle
 
 from fusion_gym.arrays import Array
@@ -21,6 +22,8 @@ from fusion_gym.validation import LONGEST, LONGEST_TEXT
 _LEAST, _MOST = 20, 5_000_000  # rows of a log, and steps from its first to its last time
 _OFF = 0.05  # of an interval: a time that is farther from the even times is counted
 _PHASE = 1e-3  # of an interval: a channel that reads later than the first by more is named
+_SIZE, _GAPS = 0.35, 0.2  # least over median change of a log on change, and its share of gaps
+_PARTS_OF_GAP, _EVEN = 40, 0.1  # most intervals of a short gap, and their error, on change
 _FIRST, _LAST = 1678, 2261  # years that nanoseconds reach
 _SAMPLE = 200  # lines or rows that show the layout of a file
 _ROUND = 3600.0, 60.0, 10.0, 1.0, 0.1, 0.01, 1e-3, 1e-6, 1e-9  # seconds of round intervals
@@ -425,7 +428,8 @@ def on_even_times(
     """Return the first reading of each channel at each step.
 
     The interval is the median difference of a channel's own readings, or the shortest where the
-    others are multiples of it. A channel that reads later than the first by part of an interval
+    others are multiples of it, or the step of which all are multiples where a channel is recorded
+    on change. A channel that reads later than the first by part of an interval
     has its readings moved.
     """
     numbers = numbers[times.notna()].set_axis(pd.DatetimeIndex(times.dropna()), axis=0)
@@ -438,7 +442,9 @@ def on_even_times(
     clock = (numbers.index - first).total_seconds().to_numpy()
     known = [clock[column] for column in numbers.notna().to_numpy().T]
     apart = np.concatenate([np.diff(own) for own in known])
-    interval = _interval(apart if len(apart) else np.diff(clock), clock[-1])
+    pairs = zip(known, numbers.to_numpy().T, strict=True)
+    fine = any(reported_change(own, column[np.isfinite(column)]) for own, column in pairs)
+    interval = _interval(apart if len(apart) else np.diff(clock), clock[-1], fine)
     steps = clock[-1] / interval
     if first.year < _FIRST or last.year > _LAST or steps >= min(_MOST, 200 * len(clock)):
         raise ConfigurationError(
@@ -466,7 +472,7 @@ def on_even_times(
     return values.set_axis(pd.DatetimeIndex(index), axis=0)
 
 
-def _interval(differences: Array, span: float) -> float:
+def _interval(differences: Array, span: float, fine: bool) -> float:
     """Return the interval of differences in seconds, round where that moves no step."""
     *lows, middle = np.quantile(differences, (0.1, 0.02, 0.5), method="lower")
     for low in lows:
@@ -476,8 +482,37 @@ def _interval(differences: Array, span: float) -> float:
             middle = low
             break
     mean = float(differences[np.abs(differences - middle) <= 0.5 * middle].mean())
+    mean = _largest_divisor(differences, lows[-1]) if fine else mean
     rounds = (round(mean / size) * size for size in _ROUND)
     return next((r for r in rounds if r and abs(r - mean) * span <= 0.1 * mean * mean), mean)
+
+
+def _largest_divisor(differences: Array, low: float) -> float:
+    """Return the largest part of ``low`` of which nearly all differences are multiples, or it."""
+    for part in range(1, _PARTS_OF_GAP + 1):
+        size = low / part
+        for most in low * 2.0 ** np.arange(1, 16):  # longer differences need a more exact size
+            near = differences[differences <= most]
+            size = float(near.sum() / np.rint(near / size).sum())
+        ratio = differences / size
+        if np.mean(np.abs(ratio - np.rint(ratio)) <= _EVEN) > 0.95:
+            return size
+    return float(low)
+
+
+def reported_change(times: NDArray[Any], values: Array) -> float:
+    """Return the size that all changes of readings (T,) at times (T,) have, zero for any size.
+
+    The gaps of a log recorded on change end in a change of at least one size. A gap of the longest
+    time may end in a smaller one.
+    """
+    gaps, changes = np.diff(times), np.abs(np.diff(values))
+    if len(gaps) < 30 or np.mean(gaps > 1.5 * np.quantile(gaps, 0.02)) < _GAPS:
+        return 0.0
+    longest = gaps > 0.95 * gaps.max()
+    own = changes[~longest] if longest.mean() > 0.02 else changes
+    size, middle = np.quantile(own, (0.02, 0.5)) if len(own) >= 30 else (0.0, 1.0)
+    return float(size) if size > _SIZE * middle else 0.0
 
 
 def _phase(steps: Array) -> float:

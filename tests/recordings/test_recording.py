@@ -526,6 +526,41 @@ def test_a_log_with_random_gaps_is_not_on_change(digits: int) -> None:
     assert recording.card[0].change == 0.0
 
 
+@pytest.mark.parametrize(("factor", "size"), [(0.9, 1.0), (0.9, 2.0), (0.97, 2.0)])
+@pytest.mark.parametrize("jitter", [0, 3])
+def test_long_silences_do_not_hide_a_log_on_change(
+    factor: float, size: float, jitter: int, tmp_path: Path
+) -> None:
+    """Sizes in stationary deviations, and times of whole seconds late by at most ``jitter``."""
+    size /= np.sqrt(1.0 - factor**2)
+    rows = on_change(factor, size).values.dropna()
+    late = np.random.default_rng(0).integers(0, jitter + 1, len(rows))
+    rows.index += pd.to_timedelta(late, unit="s")
+    rows.to_csv(tmp_path / "log.csv", index_label="time")
+    recording = Recording.read(tmp_path / "log.csv")
+    assert recording.interval == pytest.approx(pd.Timedelta("1min"), rel=1e-3) or jitter
+    assert recording.values.count().sum() == len(rows)
+    assert recording.card[0].change == pytest.approx(size, rel=0.1)
+    refused(lambda: fit(recording.select()), "recorded on change", "--on-change")
+
+
+@pytest.mark.parametrize("jitter", [0, 3])
+@pytest.mark.parametrize("slow", [False, True])
+def test_a_log_with_blocks_of_silence_is_not_on_change(
+    slow: bool, jitter: int, tmp_path: Path
+) -> None:
+    """Nor is a quantised one that repeats its readings."""
+    draw = np.random.default_rng(0)
+    path = walk(3000, 0, 0.99).round(-1) if slow else walk(3000).round(1)
+    silent = np.repeat(draw.random(300) < 0.3, 10) if not slow else draw.random(3000) < 0.3
+    index = pd.date_range("2026-01-01", periods=3000, freq="1min", name="time")
+    index += pd.to_timedelta(draw.integers(0, jitter + 1, 3000), unit="s")
+    pd.DataFrame({"a": path}, index)[~silent].to_csv(tmp_path / "log.csv")
+    recording = Recording.read(tmp_path / "log.csv")
+    assert recording.card[0].change == 0.0
+    fit(recording.select(), exact=True)
+
+
 @pytest.mark.slow
 def test_a_written_log_is_read_without_options(mast: Recording, tmp_path: Path) -> None:
     for recording in (Recording.read("tanks"), replace(mast, values=mast.values[:2000])):
