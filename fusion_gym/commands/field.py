@@ -15,7 +15,7 @@ The output folder contains ``report.html``, ``report.md``, two pictures, the opt
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -46,7 +46,9 @@ AGENT = "agent"
 _WINDOWS, _LONGEST, _SHORTEST = 60, 300, 20  # windows at least, and steps of a window
 _PRICES = 4.0  # ratio of the highest to the middle price of the agent
 _RATE, _START = 0.05, 1e-3  # target rate by default, and least rate of a tolerance
-_RUNS = 60, 220  # simulations of a method, about, without and with its own threshold a sensor
+_TRAINING = 5  # steps of the training in the time of one step of a trial, about
+_STAGES = {"run_trial": "tuning", "train_model": "training", "point_at": "measurement",
+           "replay_whole": "replay of the whole part"}  # fmt: skip
 _COMPLETE = 0.5  # of the steps, whose residuals can be resampled
 
 
@@ -157,20 +159,25 @@ class Field(FitOptions, Long):
                  for name in [*METHODS, AGENT]}  # fmt: skip
         calls = (joblib.delayed(_measure)(study, name, paths[name], self.output, self.timesteps)
                  for name in names if not paths[name].exists())  # fmt: skip
-        total, over = sum(_RUNS[name != AGENT and METHODS[name][1]] for name in names), Event()
+        work = {name: field_study.work(study, name) for name in names}
+        work[AGENT]["train_model"] = 1, self.timesteps // _TRAINING
+        total, over = sum(n * steps for own in work.values() for n, steps in own.values()), Event()
         workers = joblib.Parallel(self.workers, return_as="generator_unordered", batch_size=1)
-        with progress_bar(total, "methods", _runs(study), unit="runs", most=20.0) as bar:
+        with progress_bar(total, "methods", _progress(study, paths, work)[0], most=20.0) as bar:
 
             def watch() -> None:
                 while not over.wait(1.0):
-                    bar.reach(_runs(study))
+                    done, stages = _progress(study, paths, work)
+                    bar.reach(done)
+                    bar.say(stages)
 
             Thread(target=watch, daemon=True).start()
             try:
-                for name in workers(calls):
-                    bar.say(name)
+                for _ in workers(calls):
+                    pass
             finally:
                 over.set()
+            bar.say("")
             bar.reach(total)
         return paths
 
@@ -187,14 +194,27 @@ def tolerances(words: Sequence[str], names: Sequence[str]) -> tuple[float, ...]:
     return tuple(number("tolerance", named[name], above=0.0) for name in names)
 
 
-def _runs(study: FieldStudy) -> int:
-    """Return the number of simulations that the folder holds."""
-    return len(list(cast(Path, study.trials).rglob("output.pkl")))
+def _progress(
+    study: FieldStudy, paths: Mapping[str, Path], work: Mapping[str, field_study.Work]
+) -> tuple[int, str]:
+    """Return the simulated steps that the folder holds, and the present stage of each method."""
+    done, stages = 0, []
+    for name, own in work.items():
+        trials, stage = cast(Path, study.trials) / paths[name].stem, ""
+        ended = paths[name].exists()
+        for function in reversed([stage for stage in _STAGES if stage in own]):
+            calls, steps = own[function]
+            held = len(list(trials.rglob(f"{function}/*/output.pkl")))
+            done += steps * (calls if ended else min(held, calls))
+            stage = stage if ended or held >= calls else _STAGES[function]
+            ended = ended or held > 0  # the stages before have ended, too
+        stages += [f"{name}: {stage}"] if stage and trials.exists() else []
+    return done, "; ".join(stages)
 
 
 def _measure(study: FieldStudy, name: str, path: Path, folder: Path, timesteps: int) -> str:
     """Measure one method, and write its points."""
-    own = name == AGENT
+    own, study = name == AGENT, replace(study, trials=cast(Path, study.trials) / path.stem)
     points = (
         train_agent(study, folder / "agent", timesteps) if own else field_study.measure(study, name)
     )
@@ -222,8 +242,13 @@ def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodP
         "validation": {"every": max(timesteps // 3, 1), "episodes": 64},
         "output": str(folder),
     })  # fmt: skip
-    if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
-        raise KeyboardInterrupt
+    study.call(train_model, experiment, folder)
     rule, priced = f"model:{folder / 'best_model.zip'}", {**drawn, "reward_scale": 1.0}
     rules = [([price], "joint", priced, f"{rule},price={price!r}") for price in prices]
     return field_study.measured(study, rules, None if study.tolerance else len(rules) // 2)
+
+
+def train_model(study: FieldStudy, experiment: Experiment, folder: Path) -> None:
+    """Train the model of an experiment in a folder, or continue its training."""
+    if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
+        raise KeyboardInterrupt

@@ -29,15 +29,13 @@ _EVERY, _MOST, _SHARE = 20.0, 600.0, 0.1
 
 
 class _Clock(ProgressColumn):
-    """Time since the start or resumption, and what remains at the mean speed so far."""
+    """Time since the start or resumption, and what remains at the mean speed to the last gain."""
 
     def render(self, task: Task) -> Text:
         elapsed, gained = task.elapsed or 0.0, task.completed - task.fields["initial"]
         text, left = _time(elapsed), "?"
         if gained > 0.0:
-            reached = task.fields["reached"]
-            needed = reached * (task.remaining or 0.0) / gained
-            left = _time(max(needed - (elapsed - reached), 0.0))
+            left = _time(task.fields["reached"] * (task.remaining or 0.0) / gained)
         return Text(text if task.finished else f"{text}, {left} left", "progress.remaining")
 
 

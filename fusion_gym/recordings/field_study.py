@@ -47,6 +47,9 @@ _REACH = 3.0  # of the logarithm of a sensor's threshold, from the common scale
 _BLOCK = 5  # windows of a block of the bootstrap
 
 
+Work = dict[str, tuple[int, int]]  # most calls of a function, and steps of a call
+
+
 class Trial(NamedTuple):
     """A method's error, packets a sensor and step, and each channel's root mean square error."""
 
@@ -196,6 +199,19 @@ class MethodResult:
     relative: Interval
     packets: float
     ratio: float
+
+
+def work(study: FieldStudy, name: str) -> Work:
+    """Return the work of a method, or of an agent, whose prices are at two rates."""
+    far, near = (math.ceil(math.log2(2.0 * reach / _CLOSE)) for reach in (_FAR, _NEAR))
+    window, trials = study.max_interval + max(study.horizon, study.max_interval), 2 * far
+    if name in METHODS:
+        each = METHODS[name][1]
+        trials = far + len(FACTORS) * near + each * (_TRIALS + 1 + len(study.shape))
+        trials += far * (1 + each) * bool(study.tolerance)
+    length = study.horizon + window * (1 + bool(study.tolerance))
+    return {"run_trial": (trials, study.horizon), "point_at": (len(FACTORS), length),
+            "replay_whole": (1, study.lengths[1])}  # fmt: skip
 
 
 def measure(study: FieldStudy, name: str) -> list[MethodPoint]:

@@ -19,6 +19,8 @@ from fusion_gym.recordings.field_study import (
     PRACTICE,
     FieldStudy,
     MethodPoint,
+    Replay,
+    Trial,
     compare_with_practice,
     measure,
     replay_whole,
@@ -150,6 +152,49 @@ def test_what_is_reported_is_one_replay_of_the_other_part(
     np.testing.assert_allclose(result.deviations, errors, rtol=1e-6)
     weights = np.array(plant.options["state_weights"])
     assert result.errors[0] == pytest.approx(weights @ errors**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("tolerance", [(), (0.5, 0.5)])
+@pytest.mark.parametrize("name", ["centralised", "silence used, one a sensor"])
+def test_each_simulation_advances_the_progress_to_its_total(
+    name: str, tolerance: tuple[float, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its steps; a stage that ends before its most calls counts as a whole."""
+
+    def run_trial(study: FieldStudy, name: str, sizes: Any, source: str) -> Trial:
+        return Trial(float(sizes.mean()), float(0.1 / sizes.mean()), sizes.tolist())
+
+    def point_at(study: FieldStudy, sizes: Any, *_: Any) -> MethodPoint:
+        return MethodPoint(sizes, 1.0, [1.0], [[1.0]], sizes[:1] * 2)
+
+    def replay_whole(*_: Any) -> Replay:
+        return Replay(np.ones(1), np.ones((1, 2)), np.ones(2))
+
+    def call(self: FieldStudy, function: Any, *arguments: Any) -> Any:
+        done, before = progress()[0], len(list(tmp_path.rglob("output.pkl")))
+        result = original(self, function, *arguments)
+        steps = work[name][function.__name__][1]
+        new = len(list(tmp_path.rglob("output.pkl"))) - before
+        gained, stage = progress()[0] - done, field._STAGES[function.__name__]
+        assert gained == steps * new or (stage not in stages and gained >= steps)
+        stages.append(stage)
+        return result
+
+    def progress() -> Any:
+        return field._progress(study, {name: tmp_path / "a.json"}, work)
+
+    for stub in (run_trial, point_at, replay_whole):
+        monkeypatch.setattr(field_study, stub.__name__, stub)
+    study = replace(STUDY, trials=tmp_path / "trials", lengths=(90, 70), tolerance=tolerance)
+    work, stages, original = {name: field_study.work(study, name)}, list[str](), FieldStudy.call
+    total = sum(calls * steps for calls, steps in work[name].values())
+    assert progress() == (0, "")
+    monkeypatch.setattr(FieldStudy, "call", call)
+    field._measure(study, name, tmp_path / "a.json", tmp_path, 10)
+    assert progress() == (total, "")
+    assert list(dict.fromkeys(stages)) == ["tuning", "measurement", "replay of the whole part"]
+    (tmp_path / "a.json").unlink()
+    assert progress()[0] == total
 
 
 ROOM = ["--exact", "--share", "0.6", "--workers", "1", "--timesteps", "10"]
