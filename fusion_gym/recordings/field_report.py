@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import yaml
 from markdown_it import MarkdownIt
 from matplotlib.ticker import LogLocator
@@ -350,16 +351,27 @@ def device_table(report: FieldReport) -> str:
     return table(heads, rows)
 
 
+def curve_of(points: Sequence[MethodPoint]) -> tuple[Array, Array]:
+    """Return rising rates and their errors; rates of equal two digits have one mean, zero none."""
+    table = pd.DataFrame([(np.mean(p.rates), np.mean(p.errors)) for p in points]).astype(float)
+    table = table[table[0] > 0.0]
+    digits = table[0].map("{:.2g}".format).to_numpy()
+    rate, error = table.groupby(digits).mean().sort_values(0).to_numpy().T
+    return rate, error
+
+
 def draw_curves(
     study: field_study.FieldStudy, points: Mapping[str, Sequence[MethodPoint]], path: Path
 ) -> None:
     """Draw error over packets of every method on the held-out part."""
     plt.rcParams.update(READABLE)
     figure, panel = plt.subplots(figsize=(7.5, 4.8))
-    for name, own in points.items():
-        rates = [np.mean(point.rates) for point in own]
-        errors = [np.mean(point.errors) for point in own]
-        panel.loglog(rates, errors, "o-", ms=4, label=name)
+    for place, (name, own) in enumerate(points.items()):
+        rate, error = curve_of(own)
+        style: dict[str, Any] = {"marker": "os^vDP*"[place % 7], "ms": 6, "mfc": "none"}
+        style |= {} if name in METHODS else {"ls": "--", "color": "black", "zorder": 3}
+        label = name if len(rate) else f"{name} (no packets)"
+        panel.loglog(rate, error, label=label, **style)
     if not study.tolerance:
         panel.axvline(study.rate, color="grey", lw=1, ls=":")
     panel.set(xlabel="packets a sensor and step", ylabel="error, as a share of the variance")

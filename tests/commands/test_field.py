@@ -13,7 +13,7 @@ from command_runs import call, refusal, succeed
 from fusion_gym import Reception
 from fusion_gym.commands import field
 from fusion_gym.recordings import Recording, field_study, fit
-from fusion_gym.recordings.field_report import fields_of, longest_interval, step_of
+from fusion_gym.recordings.field_report import curve_of, fields_of, longest_interval, step_of
 from fusion_gym.recordings.field_study import (
     METHODS,
     PRACTICE,
@@ -54,6 +54,14 @@ def test_methods_are_compared_at_equal_packets_and_at_equal_error() -> None:
     assert results["centralised"].relative.low < -0.25 < results["centralised"].relative.high
     assert results[PRACTICE].packets == pytest.approx(1.0)
     assert results[PRACTICE].ratio == pytest.approx(1.0)
+
+
+def test_a_curve_rises_in_rate_without_points_that_send_nothing() -> None:
+    factors = (2.0, 0.0, 0.5, 0.0, 2.01, 1.0)
+    rates, errors = curve_of([point(f, 3.0 - f) for f in factors])
+    np.testing.assert_allclose(rates, [0.025, 0.05, 0.10025])
+    np.testing.assert_allclose(errors, [2.5, 2.0, 0.995])
+    assert curve_of([point(0.0, 1.0)])[0].size == 0
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
