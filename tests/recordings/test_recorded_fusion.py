@@ -21,6 +21,7 @@ from fusion_gym.evaluation import run_episodes
 from fusion_gym.recordings import FittedPlant, Recording, fit
 from fusion_gym.recordings.environment import ResampledNoise
 from fusion_gym.recordings.fitting import deviations
+from fusion_gym.systems.tobit.system import Announcement
 from fusion_gym.validation import ConfigurationError
 
 ENV = "fusion_gym/RecordedFusion-v1"
@@ -323,3 +324,17 @@ def test_a_live_stream_gives_the_estimates_of_the_replay_after_restarts_and_late
     for state, expected in zip(states[1:], replay, strict=True):
         assert np.array_equal(state.mean, expected.mean)
         assert np.array_equal(state.covariance, expected.covariance)
+
+
+def test_a_stream_starts_from_its_own_readings_and_refuses_infinite_ones(log: str) -> None:
+    task = make(log)
+    centre, day, first = task.estimator, np.array([0.25]), np.array([51.0, 47.5])[:, None, None]
+    deviation = first - centre.level.at(day, np.zeros(1))
+    state = centre.start(deviation, Announcement(np.zeros((2, 1)), day))
+    assert np.allclose(state.mean, deviation[:, 0])
+    state = centre.predict(state)
+    for value in (np.inf, -np.inf):
+        readings = np.array([np.nan, value])[:, None, None]
+        refused(
+            lambda r=readings: centre.observe(state, r), f"measurement = {value}", "or NaN where"
+        )

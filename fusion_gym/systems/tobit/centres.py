@@ -453,8 +453,8 @@ def joint_centre(
     if channels > _MOST_CHANNELS:
         raise ConfigurationError(
             f"filter = {options.filter!r} is not allowed with {sensors.count} sensors of "
-            f"{sensors.size} channels: together they may have at most {_MOST_CHANNELS}, because a step costs "
-            "their cube; with independent noises 'kalman' is the same filter"
+            f"{sensors.size} channels: together they may have at most {_MOST_CHANNELS}, because a "
+            "step costs their cube; with independent noises 'kalman' is the same filter"
         )
     return kind(KalmanFilter(sensors), np.ones((sensors.count, 1)))
 

@@ -381,6 +381,9 @@ class CensoredEstimator(
         if self.level is None:
             return super().observe(state, measurement)
         available = np.isfinite(measurement[:, 0])
+        if (wrong := np.isinf(measurement)).any():
+            allowed = "finite numbers, or NaN where no packet arrives"
+            raise refusal("measurement", float(measurement[wrong][0]), allowed)
         expected = sensed(state.prediction).own[0]
         filled = np.where(available[:, None], measurement, expected)
         return replace(state, measurement=filled, available=available)

@@ -18,14 +18,14 @@ MIXED = {
     "measurement_matrices": [[1, 0], [[0, 1], [1, 1]], [1, -1]],
     "measurement_covariances": [0.2, [[0.3, 0.0], [0.0, 0.2]], 0.1],
 }
+CORRELATED = {"joint_measurement_covariance": [[1.0, 0.5], [0.5, 1.0]]}
 
 
 @pytest.mark.parametrize(
     ("env_id", "options"),
-    [(LINEAR, {}), (LINEAR, MIXED), (LINEAR, {"joint_measurement_covariance": [[1, 0.5], [0.5, 1]]}),
-     (RECORDED, {})],
+    [(LINEAR, {}), (LINEAR, MIXED), (LINEAR, CORRELATED), (RECORDED, {})],
     ids=["default", "mixed", "correlated", "recorded"],
-)  # fmt: skip
+)
 def test_an_innovation_is_that_of_a_filter_of_the_own_deliveries(
     env_id: str, options: dict[str, Any]
 ) -> None:
