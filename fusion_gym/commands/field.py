@@ -173,8 +173,7 @@ class Field(FitOptions, Long):
 
             Thread(target=watch, daemon=True).start()
             try:
-                for _ in workers(calls):
-                    pass
+                list(workers(calls))
             finally:
                 over.set()
             bar.say("")

@@ -370,8 +370,7 @@ def draw_curves(
         rate, error = curve_of(own)
         style: dict[str, Any] = {"marker": "os^vDP*"[place % 7], "ms": 6, "mfc": "none"}
         style |= {} if name in METHODS else {"ls": "--", "color": "black", "zorder": 3}
-        label = name if len(rate) else f"{name} (no packets)"
-        panel.loglog(rate, error, label=label, **style)
+        panel.loglog(rate, error, label=name + " (no packets)" * (not rate.size), **style)
     if not study.tolerance:
         panel.axvline(study.rate, color="grey", lw=1, ls=":")
     panel.set(xlabel="packets a sensor and step", ylabel="error, as a share of the variance")

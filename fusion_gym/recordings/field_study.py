@@ -45,8 +45,6 @@ _FAR, _NEAR, _CLOSE = 7.0, 1.5, 0.02  # reaches and tolerance of the logarithm o
 _QUIET, _BUSY = 0.6, 0.8  # changes of logarithms where one sensor speaks for the others
 _REACH = 3.0  # of the logarithm of a sensor's threshold, from the common scale
 _BLOCK = 5  # windows of a block of the bootstrap
-
-
 Work = dict[str, tuple[int, int]]  # most calls of a function, and steps of a call
 
 
@@ -210,8 +208,8 @@ def work(study: FieldStudy, name: str) -> Work:
         trials = far + len(FACTORS) * near + each * (_TRIALS + 1 + len(study.shape))
         trials += far * (1 + each) * bool(study.tolerance)
     length = study.horizon + window * (1 + bool(study.tolerance))
-    return {"run_trial": (trials, study.horizon), "point_at": (len(FACTORS), length),
-            "replay_whole": (1, study.lengths[1])}  # fmt: skip
+    measured = {"point_at": (len(FACTORS), length), "replay_whole": (1, study.lengths[1])}
+    return {"run_trial": (trials, study.horizon), **measured}
 
 
 def measure(study: FieldStudy, name: str) -> list[MethodPoint]:
