@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.recordings.reading import reported_change, run_lengths
+from fusion_gym.recordings.reading import reported_changes, run_lengths
 
 _SATURATED = 0.01  # share of readings at an extreme value that is a limit
 _STUCK = 12  # equal readings in a row, at least, of a channel that is stuck
@@ -88,12 +88,13 @@ def cards(values: pd.DataFrame, channels: Sequence[RecordedChannel]) -> tuple[Ch
     agreements = {name: float(values[name].corr(values[own].median(axis=1)))
                   for name, own in peers.items() if len(own) > 1}  # fmt: skip
     copied, result = _copies(values), []
-    for channel in channels:
+    moved = reported_changes(np.arange(len(values)), values.to_numpy())
+    for channel, change in zip(channels, moved.tolist(), strict=True):
         name, others = channel.name, [agreements.get(peer, 0.0) for peer in peers[channel.name]]
         card = _card(values[name], channel, agreements.get(name, float("nan")))
         apart = card.agreement < _FAULTY and np.median(others) >= _AGREEMENT
         fault = card.fault or copied.get(name, "disagrees with its peers" * bool(apart))
-        result.append(replace(card, fault=fault))
+        result.append(replace(card, fault=fault, change=change))
     return tuple(result)
 
 
@@ -112,8 +113,7 @@ def _card(column: pd.Series, channel: RecordedChannel, agreement: float) -> Chan
     jumps = np.minimum(size[1:], size[:-1]) * (changes[1:] * changes[:-1] < 0.0)
     faults = {"constant": len(distinct) == 1, "stuck": stuck > 0.5, "counts": _counts_up(values),
               "wraps around": _wraps(values)}  # fmt: skip
-    places = np.flatnonzero(column.notna())
-    every = float(np.median(np.diff(places))) if changes.size else 0.0
+    every = float(np.median(np.diff(np.flatnonzero(column.notna())))) if changes.size else 0.0
     several = len(distinct) > 1
     return ChannelCard(
         channel=channel, readings=len(values), missing=1.0 - len(values) / len(column),
@@ -122,7 +122,6 @@ def _card(column: pd.Series, channel: RecordedChannel, agreement: float) -> Chan
         saturated=float(saturated.mean()) if several else 0.0, stuck=stuck,
         spikes=int((jumps > _SPIKE * usual).sum()), agreement=agreement,
         fault=next((fault for fault, true in faults.items() if true), ""),
-        change=reported_change(places, values),
     )  # fmt: skip
 
 

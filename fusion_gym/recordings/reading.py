@@ -23,6 +23,11 @@ _LEAST, _MOST = 20, 5_000_000  # rows of a log, and steps from its first to its 
 _OFF = 0.05  # of an interval: a time that is farther from the even times is counted
 _PHASE = 1e-3  # of an interval: a channel that reads later than the first by more is named
 _SIZE, _GAPS = 0.35, 0.2  # least over median change of a log on change, and its share of gaps
+_EXPECTED, _RARE = 12.0, 0.1  # rows of small changes, and their share in a log on change, at most
+_FEW, _LARGEST = (
+    (0.06, 0.02),
+    0.7,
+)  # shares of a channel's changes that are small, and the largest share
 _PARTS_OF_GAP, _EVEN = 40, 0.1  # most intervals of a short gap, and their error, on change
 _FIRST, _LAST = 1678, 2261  # years that nanoseconds reach
 _SAMPLE = 200  # lines or rows that show the layout of a file
@@ -442,9 +447,8 @@ def on_even_times(
     clock = (numbers.index - first).total_seconds().to_numpy()
     known = [clock[column] for column in numbers.notna().to_numpy().T]
     apart = np.concatenate([np.diff(own) for own in known])
-    pairs = zip(known, numbers.to_numpy().T, strict=True)
-    fine = any(reported_change(own, column[np.isfinite(column)]) for own, column in pairs)
-    interval = _interval(apart if len(apart) else np.diff(clock), clock[-1], fine)
+    fine = reported_changes(clock, numbers.to_numpy()).any()
+    interval = _interval(apart if len(apart) else np.diff(clock), clock[-1], bool(fine))
     steps = clock[-1] / interval
     if first.year < _FIRST or last.year > _LAST or steps >= min(_MOST, 200 * len(clock)):
         raise ConfigurationError(
@@ -500,14 +504,49 @@ def _largest_divisor(differences: Array, low: float) -> float:
     return float(low)
 
 
-def reported_change(times: NDArray[Any], values: Array) -> float:
+def reported_changes(times: NDArray[Any], values: Array) -> Array:
+    """Return the size (l,) of a channel's changes in readings (T, l) at times (T,), 0 for any size.
+
+    A log on change may have a row for each channel that changes, or for all if one changes. Small
+    changes of all channels together are then far rarer than their shares say.
+    """
+    pairs = ((times[known], column[known])
+             for column, known in zip(values.T, np.isfinite(values).T, strict=True))  # fmt: skip
+    result = np.array([_reported_change(*own) for own in pairs])
+    known = np.isfinite(values).all(axis=1)
+    count, changes = len(result), np.abs(np.diff(values[known], axis=0))
+    if result.any() or count == 1 or not _has_gaps(np.diff(times[known])):
+        return result
+    share = _EXPECTED / len(changes)
+    levels = [np.full(count, share ** (1.0 / count))]
+    for few in _FEW:
+        levels += [*np.where(np.eye(count) > 0.0, few, (share / few) ** (1.0 / (count - 1)))]
+    for level in levels:  # the same share of each channel, or few of one
+        if level.max() > _LARGEST:
+            continue
+        limits = [
+            np.quantile(own, q, method="lower") for own, q in zip(changes.T, level, strict=True)
+        ]
+        small = changes <= limits
+        if small.all(axis=1).sum() <= _RARE * len(changes) * small.mean(axis=0).prod():
+            others = [np.delete(small, place, axis=1).all(axis=1) for place in range(count)]
+            alone = [own[rows] for own, rows in zip(changes.T, others, strict=True)]
+            return np.array([np.quantile(own, 0.1) if len(own) else 0.0 for own in alone])
+    return result
+
+
+def _has_gaps(gaps: Array) -> bool:
+    return len(gaps) >= 30 and bool(np.mean(gaps > 1.5 * np.quantile(gaps, 0.02)) >= _GAPS)
+
+
+def _reported_change(times: NDArray[Any], values: Array) -> float:
     """Return the size that all changes of readings (T,) at times (T,) have, zero for any size.
 
     The gaps of a log recorded on change end in a change of at least one size. A gap of the longest
     time may end in a smaller one.
     """
     gaps, changes = np.diff(times), np.abs(np.diff(values))
-    if len(gaps) < 30 or np.mean(gaps > 1.5 * np.quantile(gaps, 0.02)) < _GAPS:
+    if not _has_gaps(gaps):
         return 0.0
     longest = gaps > 0.95 * gaps.max()
     own = changes[~longest] if longest.mean() > 0.02 else changes

@@ -19,6 +19,7 @@ from fusion_gym.validation import LARGEST, number
 # Shipped logs by name: three made-up tanks, and a wind mast (from brightwind 2.7.0, MIT).
 SHIPPED = {name: Path(__file__).with_name(f"{name}.csv{end}")
            for name, end in (("tanks", ""), ("mast", ".xz"))}  # fmt: skip
+_HIDING = 0.8  # reported change over the deviation, at most
 _LIMIT = r"-?[0-9]+(?:\.[0-9]+)?|-?\.[0-9]+"
 _ENDS = {"low": -np.inf, "high": np.inf}
 _ROUND_UNIT = r"\(([°℃℉%].{0,4}|[mhk]?Pa|mbar|deg ?[CF]|[CFK]|[mk]?[VAWm]|[cm]m|ppm|lx|k?Wh|m/s)\)"
@@ -184,7 +185,17 @@ class Recording:
         In a log recorded on change, silence says that the quantity is within one change of the last
         reading. The difference acts like measurement noise, with at most the change squared as
         its variance.
+
+        Raises:
+            ConfigurationError: changes above .8 of the readings' deviation, which hide the plant.
         """
+        for row in self.card:
+            if row.change > _HIDING * row.deviation:
+                raise ConfigurationError(
+                    f"on_change = True is not allowed with {row.channel.name}: it reports changes "
+                    f"of {row.change:.3g}, and its deviation is {row.deviation:.3g}, so silence "
+                    f"hides the plant; record changes below {_HIDING * row.deviation:.2g}"
+                )
         held = self.values.ffill()
         count = int((held.notna() & self.values.isna()).to_numpy().sum())
         remark = f"{count} steps of silence have the last reading of their channel"

@@ -518,6 +518,32 @@ def test_silence_of_a_log_on_change_is_no_missing_reading(size: float, tmp_path:
     assert f"a: recorded on change by {recording.card[0].change:g}" in printed
 
 
+@pytest.mark.parametrize("sizes", [(1.0, 1.0), (0.7, 1.4), (2.0, 4.0, 2.0), (1.5, 1.5, 1.5, 1.5)])
+def test_rows_of_all_channels_where_one_changes_are_on_change(
+    sizes: tuple[float, ...], tmp_path: Path
+) -> None:
+    """Rows at random times of the same channels are not."""
+    path = np.transpose([walk(4000, seed, 0.8) for seed in range(len(sizes))])
+    rows = [0]
+    for row, values in enumerate(path):
+        if (np.abs(values - path[rows[-1]]) >= sizes).any():
+            rows.append(row)
+    index = pd.date_range("2026-01-01", periods=4000, freq="1min", name="time")
+    table = pd.DataFrame(path, index, [f"c{place}" for place in range(len(sizes))])
+    table.iloc[rows].to_csv(tmp_path / "log.csv")
+    recording = Recording.read(tmp_path / "log.csv")
+    assert recording.interval == pd.Timedelta("1min")
+    assert [row.change for row in recording.card] == pytest.approx(sizes, rel=0.4)
+    refused(lambda: fit(recording.select()), "recorded on change", "--on-change")
+    share = np.random.default_rng(0).random(4000) < min(len(rows) / 4000, 0.7)
+    table[share].to_csv(tmp_path / "log.csv")
+    assert not any(row.change for row in Recording.read(tmp_path / "log.csv").card)
+
+
+def test_changes_as_large_as_the_deviation_are_refused() -> None:
+    refused(on_change(0.8, 2.0).hold, "on_change = True", "hides the plant")
+
+
 @pytest.mark.parametrize("digits", [1, 8])
 def test_a_log_with_random_gaps_is_not_on_change(digits: int) -> None:
     path = np.where(np.random.default_rng(0).random(2000) < 0.3, np.nan, walk(2000).round(digits))
