@@ -1,7 +1,7 @@
 r"""Fit a plant to a log of sensors, and write the option file that ``system=`` takes.
 
     fusion-gym fit mast --exact --output mast.yaml
-    fusion-gym evaluate --env fusion_gym/LinearFusion-v2 --set system=mast.yaml
+    fusion-gym evaluate --env fusion_gym/LinearFusion-v2 --set system=mast.yaml --policies always
 
 Level and daily cycle of every channel are removed. The plant is a vector autoregression of the
 rest, fitted to the first part. The table compares its errors with the real errors of the other
