@@ -6,7 +6,8 @@ r"""Calibrate agents with a rule at each price of a token, without training.
 At each price the command mixes agent and rule, and sets the threshold of a request, by the cost of
 tuning episodes. The rule alone stays unless another candidate is cheaper by two standard errors. Of
 several agents the best one is taken at each price. The file is a policy:
-``model:calibrated.zip,price=0.1``.
+``model:calibrated.zip,price=0.1``, or ``model:calibrated.zip`` for agents of one price, whose
+environment has a fixed ``cost_weight``.
 """
 
 import tempfile
@@ -27,10 +28,14 @@ from fusion_gym.commands.command_line import (
     whole,
 )
 from fusion_gym.commands.search import token_prices
+from fusion_gym.core.task import Task
+from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
+from fusion_gym.errors import forbidden
 from fusion_gym.output import tables
 from fusion_gym.policies.saved import agent_files, model_file
 from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate
+from fusion_gym.training.run import PRICES
 from fusion_gym.validation import refusal
 
 
@@ -39,13 +44,13 @@ class Calibrate(EnvironmentOptions, Long):
     """Calibrate agents with a rule at each price of a token, without training."""
 
     policy: PolicyNames
-    """Agents that observe the price: model:PATH or zoo:NAME."""
+    """Agents: model:PATH or zoo:NAME."""
     output: Annotated[Path, OutputFile(".zip")]
     """The file of the calibrated policy."""
     rule: str | None = None
     """Text of a priced_threshold, as search prints it; by default the start of a search."""
-    prices: Annotated[int, whole(2, 100)] = 5
-    """Number of prices of a token, from the lowest to the highest."""
+    prices: Annotated[int | None, whole(2, 100)] = None
+    """Number of prices of a token over price_range, by default 5; not for agents of one price."""
     episodes: Annotated[int, whole(2, 100_000)] = EPISODES[1]
     """Tuning episodes of the last round."""
 
@@ -55,16 +60,25 @@ class Calibrate(EnvironmentOptions, Long):
         """Calibrate, write the policy and print a row for each price."""
         env_id, options = self.environment()
         task = make_task(env_id, **options)
-        if task.reward.price.span is None:
-            raise refusal("price_range", None, "the range of prices that the agents observe")
+        prices = self.calibrated_prices(env_id, options, task)
         named = [agent_file(name) for name in dict.fromkeys(chain(*self.policy))]
-        prices = token_prices(env_id, options, task, self.prices)
         episodes = EPISODES[0], self.episodes
         with tempfile.TemporaryDirectory() as folder:
             files = [file for path in named for file in agent_files(path, Path(folder))]
             rows = calibrate(task, files, prices, episodes, self.output, self.rule)
         tables.console().print(calibration_table(env_id, rows))
         print(f"model:{self.output}")
+
+    def calibrated_prices(self, env_id: str, options: Options, task: Task) -> tuple[float, ...]:
+        """Return the prices of the calibration: over the task's price_range, or its fixed price."""
+        price = task.reward.price
+        if price.span is not None:
+            return token_prices(env_id, options, task, self.prices or PRICES)
+        if self.prices is not None:
+            raise forbidden("prices", self.prices, "leave it out", "at one price (cost_weight)")
+        if not price.fixed:
+            raise refusal("cost_weight", price.fixed, "a positive price of a token")
+        return (price.fixed,)
 
 
 def agent_file(name: str) -> Path:

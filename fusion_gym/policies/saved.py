@@ -789,14 +789,15 @@ class CalibratedPolicy(Stateless):
         """Return the agent at the policy's price, with the threshold in its last layer.
 
         Raises:
-            ConfigurationError: no price, or a price at which the rule takes part.
+            ConfigurationError: no price of several, or a price at which the rule takes part.
         """
-        if self.price is None:
+        if self.price is None and len(self.points) > 1:
             raise refusal("price", None, "a number: model:PATH,price=…")
-        (number,), (mixture,), (threshold,) = self.at(np.array([self.price]))
+        price = self.points[0].price if self.price is None else self.price
+        (number,), (mixture,), (threshold,) = self.at(np.array([price]))
         if mixture > 0.0:
             why = (
-                f"0 at the price {self.price:g}: the rule reads signals that a file does not have; "
+                f"0 at the price {price:g}: the rule reads signals that a file does not have; "
                 "calibrated=false gives the agent alone"
             )
             raise refusal("mixture", float(mixture), why)

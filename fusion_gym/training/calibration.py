@@ -72,9 +72,9 @@ def calibrate(
     """Calibrate the agents of files, write the policy and return a row for each price.
 
     Args:
-        task: the task, whose price is drawn.
-        files: the agents, which observe the price.
-        prices: prices of a token in increasing order.
+        task: the task.
+        files: the agents.
+        prices: prices of a token in increasing order; the task's price for agents of one price.
         episodes: tuning episodes of all candidates, and of the last round.
         output: the file to write.
         rule: text of a priced_threshold; by default the first agent's, or the start of a search of

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_runs import succeed
+import torch
+from command_runs import refusal, succeed
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from training_configs import small_config
@@ -24,6 +25,7 @@ from fusion_gym.policies.saved import (
     ModelPolicy,
     ModelView,
     agent_files,
+    read_calibration,
     save_calibrated,
     tag_model,
 )
@@ -300,6 +302,78 @@ def test_a_failed_calibration_ends_the_training_with_its_error(
     monkeypatch.setattr(run, "calibrate", fail)
     with pytest.raises(ConfigurationError, match="a failure"):
         trained(tmp_path)
+
+
+ONE_PRICE: list[dict[str, Any]] = [
+    {"local": True},
+    {"local": False, "options": {"information": "centre"}},
+    {"local": False},
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", ONE_PRICE, ids=["local", "centre", "scheduler"])
+def test_a_silent_agent_of_one_price_is_calibrated_by_the_lines_that_a_user_types(
+    environment: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Train, calibrate, evaluate, compare and export; the agent is silenced after its training."""
+    monkeypatch.chdir(tmp_path)
+    local, options = environment["local"], environment.get("options", {})
+    options = {"horizon": 25, "cost_weight": 0.3, **options}
+    entries = {"id": LINEAR, "options": options, "local": local}
+    config = str(small_config(tmp_path, environment=entries, output="run"))
+    succeed("train", ["--config", config])
+    model = PPO.load("run/best_model.zip")
+    with torch.no_grad():
+        model.policy.action_net.bias.add_(torch.tensor([9.0, -9.0]) if local else -9.0)
+    model.save("run/best_model.zip")
+    config, agent = "run/config.yaml", "model:run/best_model.zip"
+    words = ["--config", config, "--policy", agent, "--episodes", "40"]
+    assert "0.3" in succeed("calibrate", [*words, "--output", "run/calibrated.zip"]).out
+    rule, slopes, (point,) = read_calibration(Path("run/calibrated.zip"))
+    assert point.price == 0.3
+    names = [agent, "model:run/calibrated.zip", rule]
+    words = ["--config", config, "--policies", *names]
+    succeed("evaluate", [*words, "--episodes", "200", "--json", "e.json"])
+    results = json.loads(Path("e.json").read_text())["policies"]
+    silent, ours, ruled = (results[name]["return"]["mean"] for name in names)
+    assert results[agent]["tokens"]["mean"] == 0.0 < results[names[1]]["tokens"]["mean"]
+    assert ours > silent
+    assert ours >= ruled - 0.01 * abs(ruled)
+    succeed("compare", [*words, "--episodes", "4", "--output", "compared"])
+    again = [CalibrationPoint(0.3, 0, 0.0, -99.0)]
+    save_calibrated(rule, slopes, again, [Path("run/best_model.zip")], Path("run/shifted.zip"))
+    assert "all decisions agree" in succeed("export", ["run/shifted.zip", "--onnx", "a.onnx"]).out
+
+
+@pytest.mark.parametrize("local", [True, False])
+def test_at_one_price_the_calibration_is_the_best_of_agent_shifted_agent_and_rule(
+    local: bool, tmp_path: Path
+) -> None:
+    """A rule that never sends is left, a good rule stays."""
+    never = RULE.format(own=str(local).lower(), margin=1).replace("0.2", "1e9")
+    for price, rule in ((0.02, never), (0.3, None)):
+        task, agent, _ = made(local=local, cost_weight=price, price_range=None)
+        files, output = [saved(agent, tmp_path)], tmp_path / "policy.zip"
+        (row,) = calibrate(task, files, (price,), (4, 40), output, rule)
+        assert row.cost <= min(row.rule_cost, row.agent_cost)
+        assert (row.point.mixture < 1.0) is (rule is not None)
+        assert rule is None or row.cost < row.rule_cost
+
+
+WRONG_PRICES: list[tuple[list[str], str]] = [
+    (["cost_weight=0"], "cost_weight = 0.0 is not allowed: it must be a positive price"),
+    (["cost_weight=0.3", "--prices", "3"], "prices = 3 is not allowed at one price"),
+    (["cost_weight=random"], "price_range"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG_PRICES)
+def test_a_calibration_without_prices_is_refused(
+    words: list[str], message: str, tmp_path: Path
+) -> None:
+    output = ["--policy", "zoo:nobody", "--output", str(tmp_path / "o.zip")]
+    assert message in refusal("calibrate", ["--env", LINEAR, "--set", *words, *output])
 
 
 @pytest.mark.parametrize("threshold", [-0.4, 0.6])
