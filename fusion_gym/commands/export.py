@@ -5,7 +5,8 @@ r"""Export a saved agent as an ONNX file, for sensors and schedulers without thi
 
 The file contains the graph from the observation to the request, and a description of the
 observation. The command compares it with the agent on 10,000 observations of whole episodes, and
-removes it if they differ.
+removes it if they differ. It prints the transmission rate in these episodes, and warns of sensors
+that never transmit. ``calibrated=false`` exports the agent alone, because a file has no rule.
 """
 
 from collections.abc import Mapping
@@ -61,6 +62,8 @@ class Export(EnvironmentOptions, Command):
             f"against the agent on {result.observations:,} observations of {result.episodes:,} "
             f"episodes of {env_id}: all decisions agree, numbers differ by at most "
             f"{result.difference:.2g}\n"
+            f"transmissions per sensor and step there: {result.rates.mean():.3g} "
+            f"(sensors: {', '.join(f'{rate:.3g}' for rate in result.rates)})\n"
             f"one decision on one thread here: {1e6 * model.latency.median:.1f} µs in the median, "
             f"99 % below {1e6 * model.latency.most:.1f} µs"
         )

@@ -25,6 +25,7 @@ from stable_baselines3.dqn.policies import DQNPolicy
 from stable_baselines3.td3.policies import TD3Policy
 
 from fusion_gym import seeds
+from fusion_gym.arrays import Array
 from fusion_gym.core.action import Threshold, space_text
 from fusion_gym.core.knowledge import MEANING, Block, Knowledge, Signals, numbered
 from fusion_gym.core.observation import ObservationLayout
@@ -384,7 +385,10 @@ class Agreement:
         different: number of observations with another decision.
         difference: greatest difference of the other outputs.
         relative: greatest difference over 1 + the size of the output.
+        rates: transmissions a step of each sensor (sensors,), means over the episodes.
     """
+
+    rates: Array
 
     def __init__(self, agent: ModelPolicy, graph: DecisionGraph, path: Path) -> None:
         self.knowledge: Knowledge = agent.knowledge
@@ -478,8 +482,21 @@ def onnx_agreement(
     """
     result = Agreement(agent, graph, path)
     episodes = math.ceil(observations / (task.horizon * agent.view.rows_per_run))
-    run_episodes(task, result, episodes, seeds.EXPORT.start)
+    rate = run_episodes(task, result, episodes, seeds.EXPORT.start).rate
+    result.rates = np.nanmean(rate, axis=0)
     return result
+
+
+def warn_of_silent_sensors(rates: Array) -> None:
+    """Warn of sensors that never transmit; ``rates`` are the sensors' transmissions a step."""
+    silent = np.flatnonzero(rates == 0.0).tolist()
+    if silent:
+        sensors = "no sensor" if len(silent) == len(rates) else f"of the sensors {silent} none"
+        warnings.warn(
+            f"{sensors} ever transmits under the exported agent: train it at a lower price of a "
+            "token (cost_weight), or calibrate it by fusion-gym calibrate",
+            stacklevel=2,
+        )
 
 
 class Exported(NamedTuple):
@@ -506,7 +523,7 @@ def export_onnx(
     """Write an agent as an ONNX file, and check it.
 
     The graph is :class:`DecisionGraph`; the metadata are :func:`onnx_card`. A file that decides
-    otherwise than the agent is removed.
+    otherwise than the agent is removed. A sensor that never transmits is warned of.
 
     Args:
         agent: a saved agent that ``make_policy`` made for this task.
@@ -537,5 +554,6 @@ def export_onnx(
             f"{result.observations:,} observations, and numbers differ by up to "
             f"{result.difference:.3g}"
         )
+    warn_of_silent_sensors(result.rates)
     taken = latency(graph, path)
     return Exported(path.stat().st_size, graph.inputs, graph.outputs, result, taken)

@@ -7,6 +7,7 @@ import io
 import json
 import re
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import torch
 from small_models import ENV, MODELS
 
 import fusion_gym
-from fusion_gym import zoo
+from fusion_gym import seeds, zoo
 from fusion_gym.commands.export import Export, spec
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
@@ -168,7 +169,8 @@ def test_agents_of_the_zoo_are_exported_with_what_they_see(name: str, tmp_path: 
     assert f"{path.stat().st_size:,} bytes" in lines[0]
     assert re.search(r"against the agent on 10,[\d]{3} observations of \d+ episodes", lines[3])
     assert "all decisions agree" in lines[3]
-    assert "µs in the median" in lines[4]
+    assert lines[4].startswith("transmissions per sensor and step there: 0.")
+    assert "µs in the median" in lines[5]
     trained = zoo.card(name)["training"]["environment"]
     task = fusion_gym.make_task(trained["id"], **trained["options"])
     result, local = describe(path), "local" in name
@@ -266,6 +268,36 @@ def test_a_training_of_ones_own_says_its_environment(tmp_path: Path) -> None:
     assert describe(path)["options"]["horizon"] == 20
     by_hand = command(f"model:{tmp_path / 'best_model.zip'}", path, "filter=tobit", env=ENV)
     assert by_hand[3] != lines[3]  # its episodes are longer
+
+
+@pytest.mark.usefixtures("few")
+@pytest.mark.parametrize(
+    ("bias", "silent"),
+    [([0, 0, 0], None), ([0, -99, -99], r"of the sensors \[1, 2\] none"), ([-99] * 3, "no sensor")],
+)
+def test_an_export_says_its_rate_and_warns_of_silent_sensors(
+    bias: list[float], silent: str | None, tmp_path: Path
+) -> None:
+    """The rates are those of the agent on the same episodes."""
+    model, task = MODELS["ppo"].build()
+    with torch.no_grad():
+        model.policy.action_net.bias.add_(torch.tensor(bias))
+    tag_model(model, task)
+    model.save(tmp_path / "agent.zip")
+    options = ("filter=tobit", "horizon=20")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", UserWarning)
+        lines = command(f"{tmp_path / 'agent.zip'}", tmp_path / "a.onnx", *options, env=ENV)
+    agent = make_policy(f"model:{tmp_path / 'agent.zip'}", task)
+    rates = run_episodes(task, agent, 25, seeds.EXPORT.start).rate.mean(0)
+    parts = ", ".join(f"{rate:.3g}" for rate in rates)
+    assert lines[4].endswith(f" there: {rates.mean():.3g} (sensors: {parts})")
+    messages = [str(item.message) for item in warned if item.category is UserWarning]
+    assert len(messages) == (silent is not None)
+    if silent is not None:
+        assert re.match(
+            f"{silent} ever transmits .* lower price .* fusion-gym calibrate", *messages
+        )
 
 
 ZOO = "zoo:tobit_oscillator_scheduler"
