@@ -1,14 +1,14 @@
 """Lower a jaxpr to LLVM's assembly, with one number for each entry of each array.
 
 An array is an object array of constants and of names of LLVM's values, so that reshaping, slicing
-and the like cost nothing at run time.
+and the like cost nothing at run time. A value is a vector with a lane for each of four runs. The
+numbers of a run do not depend on the other lanes.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
-import math
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial, reduce
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[Any]  # constants and names
+LANES = 4  # runs of a vector
 _FEW = 8  # a choice among more numbers reads them from memory
 _BOOL, _WHOLE = np.dtype(np.bool_), np.dtype(np.int64)
 
@@ -108,6 +109,39 @@ class Program:
                 raise LoweringError(f"it has more than {self.most:,} instructions")
         return self._known[text]
 
+    def lane(self, kind: Any, value: Any, lane: int) -> Any:
+        """Return the number of one lane of a value."""
+        if not isinstance(value, str):
+            return value
+        return self.emit(f"extractelement {_vector(kind)} {value}, i64 {lane}")
+
+    def join(self, kind: Any, numbers: Iterable[str]) -> str:
+        """Return the value of the numbers of all lanes."""
+        value = "poison"
+        for lane, number in enumerate(numbers):
+            pair = f"{_vector(kind)} {value}, {_type(kind)} {number}"
+            value = self.emit(f"insertelement {pair}, i64 {lane}")
+        return value
+
+    def transpose(self, kind: Any, rows: Sequence[Any]) -> list[str]:
+        """Return the columns of as many values as lanes."""
+        texts = [f"{_vector(kind)} {_value(row, kind)}" for row in rows]
+
+        def shuffle(left: str, right: str, places: tuple[int, ...]) -> str:
+            mask = ", ".join(f"i32 {place}" for place in places)
+            return self.emit(f"shufflevector {left}, {right}, <{LANES} x i32> <{mask}>")
+
+        pairs = [f"{_vector(kind)} {shuffle(texts[low], texts[low + 1], mask)}"
+                 for low in (0, 2) for mask in ((0, 4, 2, 6), (1, 5, 3, 7))]  # fmt: skip
+        return [shuffle(pairs[own], pairs[own + 2], mask)
+                for mask in ((0, 1, 4, 5), (2, 3, 6, 7)) for own in (0, 1)]  # fmt: skip
+
+    def any(self, test: Any) -> str:
+        """Return whether a test holds in any lane."""
+        name, kind = f"@llvm.vector.reduce.or.v{LANES}i1", _vector(_BOOL)
+        self.outside[f"declare i1 {name}({kind})"] = ""
+        return self.emit(f"call i1 {name}({kind} {_value(test, _BOOL)})")
+
     def block(self, label: str) -> None:
         """Begin a block."""
         self.lines.append(f"{label}:")
@@ -164,25 +198,36 @@ class Program:
         if not any(isinstance(value, str) for value in values):
             with np.errstate(all="ignore"):
                 return out.type(fold(*(kind.type(value) for value in values)))
-        operands = ", ".join(_literal(value, kind) for value in values)
-        return self.emit(f"{instruction} {_type(kind)} {operands}")
+        operands = ", ".join(_value(value, kind) for value in values)
+        return self.emit(f"{instruction} {_vector(kind)} {operands}")
 
     def call(self, function: str, kind: Any, *values: Any) -> str:
         """Return the value of a function of real numbers."""
         if kind != np.float64:
             raise LoweringError(f"it has {function!r} of {kind}")
-        text, name = _type(kind), f"@{function}.f64" if "." in function else f"@{function}"
-        types = ", ".join([text] * len(values))
+        if function == "pow" and not isinstance(values[1], str) and values[1] == 0.5:
+            root = self.call("llvm.fabs", kind, self.call("llvm.sqrt", kind, values[0]))
+            return self.select(kind, self.do("eq", kind, values[0], -np.inf), np.inf, root)
+        vector = "." in function  # LLVM's own have all lanes at once
+        text, literal = (_vector(kind), _value) if vector else (_type(kind), _literal)
+        name, types = f"@{function}{f'.v{LANES}f64' * vector}", ", ".join([text] * len(values))
         self.outside[f"declare {text} {name}({types}) nounwind willreturn memory(none)"] = ""
-        operands = ", ".join(f"{text} {_literal(value, kind)}" for value in values)
-        return self.emit(f"call {text} {name}({operands})")
+
+        def result(values: Iterable[Any]) -> str:
+            operands = ", ".join(f"{text} {literal(value, kind)}" for value in values)
+            return self.emit(f"call {text} {name}({operands})")
+
+        if vector:
+            return result(values)
+        each = ([self.lane(kind, value, lane) for value in values] for lane in range(LANES))
+        return self.join(kind, [result(numbers) for numbers in each])
 
     def select(self, kind: Any, test: Any, yes: Any, no: Any) -> Any:
         """Return one of two numbers."""
         if not isinstance(test, str):
             return yes if test else no
-        pair = ", ".join(f"{_type(kind)} {_literal(value, kind)}" for value in (yes, no))
-        return self.emit(f"select i1 {test}, {pair}")
+        pair = ", ".join(f"{_vector(kind)} {_value(value, kind)}" for value in (yes, no))
+        return self.emit(f"select {_vector(_BOOL)} {test}, {pair}")
 
     def minus(self, kind: Any, value: Any, a: Any, b: Any) -> Any:
         """Return value - a · b."""
@@ -220,14 +265,14 @@ class Program:
             how = "sext" if signed else "zext"
         else:
             how = "trunc"
-        before, after = _type(kind), _type(out)
+        before, after = _vector(kind), _vector(out)
         return value if before == after else self.emit(f"{how} {before} {value} to {after}")
 
     def bits(self, kind: Any, out: Any, value: Any) -> Any:
         """Return the bits of a number as another type of the same size."""
         if not isinstance(value, str):
             return np.asarray(value, dtype=kind).view(out)[()]
-        return self.emit(f"bitcast {_type(kind)} {value} to {_type(out)}")
+        return self.emit(f"bitcast {_vector(kind)} {value} to {_vector(out)}")
 
     def pick(self, kind: Any, values: Values, place: Any) -> Any:
         """Return the entry of a vector at a place."""
@@ -238,19 +283,24 @@ class Program:
             for number, value in enumerate(values[1:], 1):
                 result = self.select(kind, self.do("eq", _WHOLE, place, number), value, result)
             return result
-        text, size = _type(kind), f"[{len(values)} x {_type(kind)}]"
+        text, apart = _type(kind), 1
         if any(isinstance(value, str) for value in values):
-            memory = self.name("%memory")
-            self.first.append(f"{memory} = alloca {size}")
+            apart, memory = LANES, self.name("%memory")
+            self.first.append(f"{memory} = alloca [{len(values)} x {_vector(kind)}]")
             for number, value in enumerate(values):
-                into = self.emit(f"getelementptr {text}, ptr {memory}, i64 {number}")
-                self.lines.append(f"store {text} {_literal(value, kind)}, ptr {into}")
+                into = self.emit(f"getelementptr {_vector(kind)}, ptr {memory}, i64 {number}")
+                self.lines.append(f"store {_vector(kind)} {_value(value, kind)}, ptr {into}")
         else:
             entries = ", ".join(f"{text} {_literal(value, kind)}" for value in values)
-            table = f" = private unnamed_addr constant {size} [{entries}]"
+            table = f" = private unnamed_addr constant [{len(values)} x {text}] [{entries}]"
             memory = self.outside.setdefault(table, self.name("@table"))
-        address = self.emit(f"getelementptr {text}, ptr {memory}, i64 {place}")
-        return self.emit(f"load {text}, ptr {address}")
+        numbers = []
+        for lane in range(LANES):
+            at = self.emit(f"mul i64 {self.lane(_WHOLE, place, lane)}, {apart}")
+            at = self.emit(f"add i64 {at}, {lane if apart > 1 else 0}")
+            address = self.emit(f"getelementptr {text}, ptr {memory}, i64 {at}")
+            numbers.append(self.emit(f"load {text}, ptr {address}"))
+        return self.join(kind, numbers)
 
     # --- arrays ---------------------------------------------------------------------------------
 
@@ -386,26 +436,37 @@ class Program:
             return self.run(branches[int(test)], inputs)
         if len(branches) != 2:
             raise LoweringError(f"it has a choice among {len(branches)} branches")
-        taken, results = self.do("ne", kind, test, 0), []
-        labels, after = [self.name("branch"), self.name("branch")], self.name("after")
-        self.lines.append(f"br i1 {taken}, label %{labels[1]}, label %{labels[0]}")
-        for label, own in zip(labels, branches, strict=True):
-            self.block(label)
-            with self.scope():
-                results.append((self.run(own, inputs), self.label))
-            self.lines.append(f"br label %{after}")
+        taken = self.do("ne", kind, test, 0)
+        masks = self.do("not", _BOOL, taken), taken
+        each = [
+            self._where_any(equation, inputs, *own) for own in zip(branches, masks, strict=True)
+        ]
+        kinds = (out.aval.dtype for out in equation.outvars)
+        return [_each(partial(self.select, kind, taken), yes, no)
+                for kind, no, yes in zip(kinds, *each, strict=True)]  # fmt: skip
+
+    def _where_any(
+        self, equation: Any, inputs: Sequence[Values], branch: Any, mask: Any
+    ) -> list[Values]:
+        """Return the results of a branch where any lane takes it, and otherwise zeros."""
+        own, after, before = self.name("branch"), self.name("after"), self.label
+        self.lines.append(f"br i1 {self.any(mask)}, label %{own}, label %{after}")
+        self.block(own)
+        with self.scope():
+            results = self.run(branch, inputs)
+        end = self.label
+        self.lines.append(f"br label %{after}")
         self.block(after)
 
-        def either(kind: Any, *values: Any) -> Any:
-            pairs = zip(values, (label for _, label in results), strict=True)
-            edges = ", ".join(f"[ {_literal(value, kind)}, %{label} ]" for value, label in pairs)
-            return self.emit(f"phi {_type(kind)} {edges}")
+        def either(kind: Any, value: Any) -> str:
+            edges = f"[ {_value(value, kind)}, %{end} ], [ zeroinitializer, %{before} ]"
+            return self.emit(f"phi {_vector(kind)} {edges}")
 
-        every = zip(equation.outvars, *(own for own, _ in results), strict=True)
-        return [_each(partial(either, out.aval.dtype), *pair) for out, *pair in every]
+        pairs = zip(equation.outvars, results, strict=True)
+        return [_each(partial(either, out.aval.dtype), result) for out, result in pairs]
 
     def loop(self, equation: Any, *inputs: Values) -> list[Values]:
-        """Return the results of a loop."""
+        """Return the results of a loop; a lane that has ended keeps its state."""
         params, kinds = equation.params, [out.aval.dtype for out in equation.outvars]
         of_test, of_body, start = _parts(inputs, params["cond_nconsts"], params["body_nconsts"])
         head, body, after = (self.name(label) for label in ("head", "body", "after"))
@@ -415,14 +476,16 @@ class Program:
         state = [_each(lambda _: self.name(), x) for x in start]
         with self.scope():
             (test,) = self.run(params["cond_jaxpr"], (*of_test, *state))
-            choice = _literal(test[()], _BOOL)
+            choice = self.any(test[()])
             self.lines.append(f"br i1 {choice}, label %{body}, label %{after}")
             self.block(body)
             moved = self.run(params["body_jaxpr"], (*of_body, *state))
+            moved = [_each(partial(self.select, kind, test[()]), new, old)
+                     for kind, new, old in zip(kinds, moved, state, strict=True)]  # fmt: skip
             self.lines.append(f"br label %{head}")
         self.lines[place:place] = [
-            f"{name} = phi {_type(kind)} [ {_literal(a, kind)}, %{before} ], "
-            f"[ {_literal(b, kind)}, %{self.label} ]"
+            f"{name} = phi {_vector(kind)} [ {_value(a, kind)}, %{before} ], "
+            f"[ {_value(b, kind)}, %{self.label} ]"
             for kind, *parts in zip(kinds, state, start, moved, strict=True)
             for name, a, b in zip(*(x.ravel() for x in parts), strict=True)
         ]
@@ -471,19 +534,54 @@ class Buffer(NamedTuple):
     arrays: Sequence[Any]
     length: int | None = None
 
-    def places(self, code: Program, pointer: str) -> Iterator[tuple[Any, list[str]]]:
-        """Yield each array with the pointers to its entries."""
-        counter, text = itertools.count(), _type(self.kind)
-        first = code.emit(f"mul i64 %run, {self.length}") if self.length else "%run"
+    def load(self, code: Program, pointer: str) -> list[Values]:
+        """Return the arrays."""
+        kinds = self._kinds()
+        values: Values = np.empty(len(kinds), dtype=object)
+        for place, text, pointers in self._groups(code, pointer, len(kinds)):
+            loads = [code.emit(f"load {text}, ptr {own}, align 1") for own in pointers]
+            if text == _vector(self.kind):
+                values[place : place + LANES] = code.transpose(self.kind, loads)
+            else:
+                values[place] = code.join(self.kind, loads)
+        for place, kind in enumerate(kinds):
+            values[place] = code.convert(self.kind, kind, values[place])
+        parts = np.split(values, np.cumsum([array.size for array in self.arrays])[:-1])
+        return [part.reshape(own.shape) for part, own in zip(parts, self.arrays, strict=True)]
 
-        def address() -> str:
-            place = str(next(counter))
-            apart = place if self.length else code.emit(f"mul i64 %runs, {place}")
-            index = code.emit(f"add i64 {first}, {apart}")
-            return code.emit(f"getelementptr {text}, ptr {pointer}, i64 {index}")
+    def store(self, code: Program, pointer: str, arrays: Iterable[Values]) -> None:
+        """Store the arrays."""
+        kinds, kind = self._kinds(), self.kind
+        entries = (value for array in arrays for value in array.ravel())
+        values = [code.convert(own, kind, value) for own, value in zip(kinds, entries, strict=True)]
+        for place, text, pointers in self._groups(code, pointer, len(kinds)):
+            if text == _vector(kind):
+                parts = code.transpose(kind, values[place : place + LANES])
+            else:
+                each = (code.lane(kind, values[place], lane) for lane in range(LANES))
+                parts = [_literal(number, kind) for number in each]
+            pairs = zip(parts, pointers, strict=True)
+            code.lines += [f"store {text} {part}, ptr {own}, align 1" for part, own in pairs]
 
-        for array in self.arrays:
-            yield array, [address() for _ in range(math.prod(array.shape))]
+    def _kinds(self) -> list[Any]:
+        return [array.dtype for array in self.arrays for _ in range(array.size)]
+
+    def _groups(
+        self, code: Program, pointer: str, count: int
+    ) -> Iterator[tuple[int, str, list[str]]]:
+        """Yield place, type and each lane's pointer of an entry, or of four neighbours in a row.
+
+        The last four of a row may repeat some.
+        """
+        text, size = _type(self.kind), LANES if self.length and count >= LANES else 1
+        for place in (min(first, count - size) for first in range(0, count, size)):
+            far = place if self.length else code.emit(f"mul i64 %runs, {place}")
+            pointers = []
+            for lane in range(LANES):
+                first = code.emit(f"mul i64 %run{lane}, {self.length or 1}")
+                row = code.emit(f"getelementptr {text}, ptr {pointer}, i64 {first}")
+                pointers.append(code.emit(f"getelementptr {text}, ptr {row}, i64 {far}"))
+            yield place, text if size == 1 else _vector(self.kind), pointers
 
 
 def assembly(closed: Any, sources: Sequence[Buffer], sinks: Sequence[Buffer], most: int) -> str:
@@ -501,30 +599,30 @@ def assembly(closed: Any, sources: Sequence[Buffer], sinks: Sequence[Buffer], mo
     code, inputs, pointers = Program(most), [], []
     code.block("each")
     for number, buffer in enumerate(sources):
-        text, pointer = _type(buffer.kind), f"%source{number}"
-        pointers.append(pointer)
-        for array, places in buffer.places(code, pointer):
-            loads = [code.emit(f"load {text}, ptr {place}") for place in places]
-            entries = [code.convert(buffer.kind, array.dtype, load) for load in loads]
-            inputs.append(np.array(entries, dtype=object).reshape(array.shape))
+        pointers.append(f"%source{number}")
+        inputs += buffer.load(code, pointers[-1])
     results = iter(code.run(closed, inputs))
     for number, buffer in enumerate(sinks):
-        text, pointer = _type(buffer.kind), f"%sink{number}"
-        pointers.append(pointer)
-        for array, places in buffer.places(code, pointer):
-            for value, place in zip(next(results).ravel(), places, strict=True):
-                stored = _literal(code.convert(array.dtype, buffer.kind, value), buffer.kind)
-                code.lines.append(f"store {text} {stored}, ptr {place}")
+        pointers.append(f"%sink{number}")
+        buffer.store(code, pointers[-1], itertools.islice(results, len(buffer.arrays)))
+    runs = [  # the lanes behind the last run repeat it
+        f"%own{lane} = add i64 %run, {lane}\n"
+        f"%late{lane} = icmp sgt i64 %own{lane}, %last\n"
+        f"%run{lane} = select i1 %late{lane}, i64 %last, i64 %own{lane}"
+        for lane in range(LANES)
+    ]
     return "\n".join(
         (
             *(f"{name}{text}" for text, name in code.outside.items()),
             f"define void @step(i64 %runs, ptr noalias {', ptr noalias '.join(pointers)}) {{",
             "entry:",
             *code.first,
+            "%last = sub i64 %runs, 1",
             "br label %each",
             f"each:\n%run = phi i64 [ 0, %entry ], [ %next, %{code.label} ]",
+            *runs,
             *code.lines[1:],
-            "%next = add i64 %run, 1",
+            f"%next = add i64 %run, {LANES}",
             "%more = icmp slt i64 %next, %runs",
             "br i1 %more, label %each, label %done",
             "done:\nret void\n}\n",
@@ -545,6 +643,17 @@ def _type(kind: Any) -> str:
     if kind.kind == "f":
         return "float" if kind.itemsize == 4 else "double"
     return "i1" if kind == _BOOL else f"i{8 * kind.itemsize}"
+
+
+def _vector(kind: Any) -> str:
+    """Return LLVM's name of the type of a value."""
+    return f"<{LANES} x {_type(kind)}>"
+
+
+def _value(value: Any, kind: Any) -> str:
+    """Return the text of a value, of all lanes."""
+    text = _literal(value, kind)
+    return text if isinstance(value, str) else f"splat ({_type(kind)} {text})"
 
 
 def _literal(value: Any, kind: Any) -> str:

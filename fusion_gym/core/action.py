@@ -406,7 +406,7 @@ class ActionOptions(OptionGroup):
     (``"variance"``), both in units of the reward."""
     backend: Backend = "numpy"
     """Code that computes the steps. ``"compiled"``, the fastest, needs the extra ``compiled``: LLVM
-    compiles the step once, in at most six seconds."""
+    compiles the step once, in at most five seconds."""
 
 
 def space_text(space: spaces.Space[Any]) -> str:

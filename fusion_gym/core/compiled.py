@@ -36,8 +36,8 @@ from fusion_gym.importing import require
 from fusion_gym.lowering import Buffer, LoweringError, assembly
 from fusion_gym.namespace import namespace
 
-MOST_INSTRUCTIONS = 50_000  # LLVM takes about ten seconds
-MOST_OF_TRAINING = 250_000  # about a minute, once
+MOST_INSTRUCTIONS = 100_000  # LLVM takes about ten seconds
+MOST_OF_TRAINING = 300_000  # about a minute, once
 
 
 class RowStep:
@@ -383,8 +383,7 @@ def _folder() -> Path | None:
 def _compile(text: str) -> bytes:
     """Return the object code of a module in assembly."""
     machine, module = _machine(), llvm.parse_assembly(text)
-    options = llvm.create_pipeline_tuning_options(speed_level=2)
-    options.slp_vectorization = True
+    options = llvm.create_pipeline_tuning_options(speed_level=1)
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
     code: bytes = machine.emit_object(module)
@@ -396,7 +395,7 @@ def _machine(jit: bool = False) -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target, features = llvm.Target.from_default_triple(), llvm.get_host_cpu_features().flatten()
-    return target.create_target_machine(llvm.get_host_cpu_name(), features, opt=2, jit=jit)
+    return target.create_target_machine(llvm.get_host_cpu_name(), features, opt=1, jit=jit)
 
 
 @functools.cache

@@ -39,7 +39,10 @@ VALUES = np.array([-np.inf, -3.5, -1.0, -0.0, 0.0, 0.25, 1.0, 2.0, 7.5, np.inf, 
 def run(
     function: Callable[..., Any], *columns: Any, most: int = compiled.MOST_INSTRUCTIONS
 ) -> np.ndarray:
-    """The results (entries, N) of a function of columns (entries,), in N = 2 equal runs."""
+    """The results (entries,) of a function of columns (entries,).
+
+    Each of six runs, of rolled columns, has the bits of the run alone.
+    """
     arrays = [np.asarray(column, np.float64)[:, None] for column in columns]
     closed = jax.make_jaxpr(lambda *x: jnp.atleast_1d(function(*(a[:, 0] for a in x))))(*arrays)
     real = np.dtype(np.float64)
@@ -51,11 +54,17 @@ def run(
     engine.finalize_object()
     pointers = [ctypes.c_void_p] * 2
     step = ctypes.CFUNCTYPE(None, ctypes.c_int64, *pointers)(engine.get_function_address("step"))
-    inputs = np.repeat(np.concatenate(arrays), 2, axis=1)
-    result = np.empty((2, out.size))
-    step(2, inputs.ctypes.data, result.ctypes.data)
-    np.testing.assert_array_equal(result[0], result[1])
-    return result[0]
+    rows = [np.concatenate([np.roll(a[:, 0], turn) for a in arrays]) for turn in range(6)]
+
+    def results(runs: list[np.ndarray]) -> np.ndarray:
+        inputs, result = np.ascontiguousarray(np.transpose(runs)), np.empty((len(runs), out.size))
+        step(len(runs), inputs.ctypes.data, result.ctypes.data)
+        return result
+
+    together = results(rows)
+    for own, row in zip(together, rows, strict=True):
+        np.testing.assert_array_equal(own, results([row])[0])
+    return together[0]
 
 
 def doubled_or_summed(a: Any) -> Any:
@@ -67,6 +76,12 @@ def newton(x: Any) -> Any:
     start = jnp.ones(x.shape), x, 0
     far = lambda s: (jnp.abs(s[0] * s[0] - s[1]) > 1e-14 * s[1]).any() & (s[2] < 60)  # noqa: E731
     return lax.while_loop(far, lambda s: ((s[0] + s[1] / s[0]) / 2, s[1], s[2] + 1), start)[0]
+
+
+def halvings(x: Any) -> Any:
+    """How often the first number is halved until it is 1 at most."""
+    start = x[0], 0.0
+    return lax.while_loop(lambda s: s[0] > 1.0, lambda s: (s[0] / 2.0, s[1] + 1.0), start)[1]
 
 
 PAIR, FINITE = (VALUES, VALUES[::-1]), VALUES[1:-2]
@@ -125,6 +140,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
     "a branch": (doubled_or_summed, ([1.0, 2.0],)),
     "another branch": (doubled_or_summed, ([-1.0, 2.0],)),
     "a loop": (newton, ([2.0, 9.0],)),
+    "loops of several lengths": (halvings, ([2.0, 9.0, 700.0],)),
     "a recursion": (lambda a: lax.scan(lambda c, x: (c * 0.5 + x, c), 0.0, a)[1], (FINITE,)),
     "choices": (lambda a: jnp.select([a > 1.0, a < 0.0], [a, -a], 7.0), (VALUES,)),
     "types": (lambda a: a.astype(np.float32) + a.astype(int).astype(np.float32), (FINITE,)),
