@@ -6,12 +6,9 @@ The code is kept in ``~/.cache/fusion-gym/compiled``, so that only the first sta
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 import functools
 import hashlib
-import io
 import itertools
-import pickle
 import threading
 import warnings
 from collections import deque
@@ -197,7 +194,6 @@ def _places(arrays: Sequence[NDArray[Any]]) -> list[slice]:
 require("backend='compiled'", "compiled", "llvmlite")
 import llvmlite.binding as llvm  # noqa: E402
 
-_PACKAGE = Path(__file__).parent.parent
 _LOADED: WeakValueDictionary[str, Any] = WeakValueDictionary()  # engines in use
 _RECENT: deque[Any] = deque(maxlen=64)  # engines that may be used again
 _LOCK = threading.RLock()  # of the threads that compile
@@ -405,40 +401,5 @@ def _surroundings() -> str:
     return repr((libraries, llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()))
 
 
-@functools.cache
-def _sources() -> bytes:
-    """Return what the assembly of a task depends on: the content of the package's files."""
-    files = sorted(_PACKAGE.rglob("*.py"))
-    return b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
-
-
-class _Parts(pickle.Pickler):
-    """A pickler of dataclasses by their fields, without what they have cached."""
-
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file)
-        self.fast = True  # independent of which objects are the same
-        self.modules: set[str] = set()
-
-    def reducer_override(self, part: Any) -> Any:
-        """Note the module of a class or function, and reduce a dataclass to its fields."""
-        self.modules.add(getattr(part, "__module__", None) or type(part).__module__)
-        if isinstance(part, type) or not dataclasses.is_dataclass(part):
-            return NotImplemented
-        return type(part), tuple(getattr(part, own.name) for own in dataclasses.fields(part))
-
-
 def _fingerprint(task: Any) -> str | None:
-    """Return a hash of a task, or ``None`` if code outside of this package determines it."""
-    pickler = _Parts(file := io.BytesIO())
-    try:
-        pickler.dump(task)
-    except Exception:  # a part cannot be pickled
-        return None
-    if any(
-        name.partition(".")[0]
-        not in ("fusion_gym", "numpy", "builtins", "types", "functools", "copyreg", "collections")
-        for name in pickler.modules
-    ):
-        return None
-    return hashlib.sha256(_surroundings().encode() + _sources() + file.getvalue()).hexdigest()
+    return code_cache.key_of(task, _surroundings())

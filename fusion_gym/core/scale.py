@@ -14,6 +14,7 @@ import numpy as np
 
 from fusion_gym import linalg, seeds, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core import code_cache
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.network import Network
 from fusion_gym.core.task import CommonOptions, Scenario, Task
@@ -208,12 +209,14 @@ def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
 
 
 def _stored(simulate: Callable[[Task], Any], options: CommonOptions, build: Build) -> Any:
-    """Return the cached result of a simulation of options."""
+    """Return the result of a simulation of options, from this process or an earlier one."""
     key = simulate, build, json.dumps(plain_options(asdict(options)), default=repr)
     if key not in _STORED:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            _STORED[key] = simulate(Task.create(build(options)))
+            task = Task.create(build(options))
+            parts = simulate.__name__, task
+            _STORED[key] = code_cache.stored("values", parts, lambda: simulate(task))
     return _STORED[key]
 
 
