@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotri, dpstrf
 
 from fusion_gym.namespace import namespace, set_at, update_at
 
@@ -143,6 +142,9 @@ def _by_lane(function: Callable[..., FloatArray], *matrices: FloatArray) -> Floa
 
 def _inverse_of_stack(stack: FloatArray) -> FloatArray:
     """Return inverses of a stack ``(..., n, n)`` by LAPACK, NaN where Cholesky's method fails."""
+    # Imported here, because scipy.linalg takes a fifth of a second to load.
+    from scipy.linalg.lapack import dpotrf, dpotri
+
     size = stack.shape[-1]
     lower = np.empty((stack.size // size**2, size, size))
     for matrix, result in zip(stack.reshape(lower.shape), lower, strict=True):
@@ -355,6 +357,8 @@ def root(a: FloatArray) -> FloatArray:
 
 def _root_of_stack(stack: FloatArray) -> FloatArray:
     """Return roots of a stack ``(..., n, n)`` by LAPACK's pivoted Cholesky factorisation."""
+    from scipy.linalg.lapack import dpstrf
+
     size = stack.shape[-1]
     result = np.zeros((stack.size // size**2, size, size))
     for matrix, lower in zip(stack.reshape(result.shape), result, strict=True):

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 _NDARRAY = np.ndarray
@@ -236,6 +235,9 @@ def erfcx(x: Any) -> Any:
 
 def _special(array: Any) -> Any:
     if namespace(array) is np:
+        # Imported here, because scipy.special takes a fifth of a second to load.
+        import scipy.special
+
         return scipy.special
     import jax.scipy.special
 

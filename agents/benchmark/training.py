@@ -16,8 +16,9 @@ import torch
 
 from fusion_gym.entries import Plain
 from fusion_gym.output.files import replacing
+from fusion_gym.training.callbacks import DAMAGED
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.run import DAMAGED, holds_training, train
+from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import ConfigurationError
 
 

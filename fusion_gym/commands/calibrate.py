@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rich.table import Table
 
@@ -33,10 +33,11 @@ from fusion_gym.entries import Options
 from fusion_gym.envs.registration import make_task
 from fusion_gym.errors import forbidden
 from fusion_gym.output import tables
-from fusion_gym.policies.saved import agent_files, model_file
-from fusion_gym.training.calibration import EPISODES, CalibrationRow, calibrate
-from fusion_gym.training.run import PRICES
+from fusion_gym.training import EPISODES
 from fusion_gym.validation import refusal
+
+if TYPE_CHECKING:
+    from fusion_gym.training.calibration import CalibrationRow
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,10 @@ class Calibrate(EnvironmentOptions, Long):
 
     def run(self) -> None:
         """Calibrate, write the policy and print a row for each price."""
+        # Imported here, because Stable-Baselines3 takes seconds to load.
+        from fusion_gym.policies.saved import agent_files
+        from fusion_gym.training.calibration import calibrate
+
         env_id, options = self.environment()
         task = make_task(env_id, **options)
         prices = self.calibrated_prices(env_id, options, task)
@@ -71,6 +76,8 @@ class Calibrate(EnvironmentOptions, Long):
 
     def calibrated_prices(self, env_id: str, options: Options, task: Task) -> tuple[float, ...]:
         """Return the prices of the calibration: over the task's price_range, or its fixed price."""
+        from fusion_gym.training.callbacks import PRICES
+
         price = task.reward.price
         if price.span is not None:
             return token_prices(env_id, options, task, self.prices or PRICES)
@@ -83,13 +90,15 @@ class Calibrate(EnvironmentOptions, Long):
 
 def agent_file(name: str) -> Path:
     """Return the file of an agent's text, which has no settings."""
+    from fusion_gym.policies.saved import model_file
+
     kind, _, rest = name.partition(":")
     if kind not in ("model", "zoo") or "," in rest:
         raise refusal("policy", name, "model:PATH or zoo:NAME, an agent without settings")
     return model_file(zoo.model_path(rest) if kind == "zoo" else rest)
 
 
-def calibration_table(env_id: str, rows: Sequence[CalibrationRow]) -> Table:
+def calibration_table(env_id: str, rows: "Sequence[CalibrationRow]") -> Table:
     """Return the table of the calibration at each price."""
     cells = []
     for row in rows:

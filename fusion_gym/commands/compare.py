@@ -39,11 +39,10 @@ from fusion_gym.entries import Plain
 from fusion_gym.envs.registration import class_name, make_task
 from fusion_gym.evaluation import curves
 from fusion_gym.evaluation.episodes import EpisodeResults, run_several
-from fusion_gym.output import figures, tables
+from fusion_gym.output import tables
 from fusion_gym.output.files import write
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import make_policy, policy_names
-from fusion_gym.training.run import warn_of_unused_tokens
 from fusion_gym.validation import refusal
 
 Compared = Mapping[float, Mapping[str, curves.PairedComparison | None]]  # curves at rates or prices
@@ -73,6 +72,9 @@ class Compare(EnvironmentOptions, Long):
 
     def costs(self) -> Compared:
         """Run the command, and return the costs at each price."""
+        # Imported here, because matplotlib takes a third of a second to load.
+        from fusion_gym.output import figures
+
         env_id, options = self.environment()
         task = make_task(env_id, **options)
         names = list(dict.fromkeys(itertools.chain(*self.policies)))
@@ -86,6 +88,8 @@ class Compare(EnvironmentOptions, Long):
         results = self.run_all(task, every)
         for name in names:
             if name.partition(":")[0] in policy_names("agent"):
+                from fusion_gym.training.callbacks import warn_of_unused_tokens
+
                 warn_of_unused_tokens(task, float(results[texts[name][0]].tokens.mean()))
         label = short_text if len({*map(short_text, names)}) == len(names) else str
         rules = {label(name): {text: results[text] for text in texts[name]} for name in names}

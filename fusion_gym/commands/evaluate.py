@@ -13,8 +13,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
-import pydantic
-
 from fusion_gym.commands.command_line import (
     EnvironmentOptions,
     Episodes,
@@ -33,43 +31,10 @@ from fusion_gym.output.files import check_inputs, read_json, write
 from fusion_gym.output.progress import progress_bar, remark, writing
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.training.config import checked
 from fusion_gym.validation import ConfigurationError, refusal
 
 _INPUTS = "env", "episodes", "seed", "horizon", "settings"
 _DRAWN = 100  # episodes of the comparison of drawn with likeliest actions
-
-
-class Quantiles(pydantic.BaseModel):
-    """Quantiles of the episodes' error."""
-
-    median: float
-
-
-# A policy in the JSON of an evaluation: an interval for a metric, or a list.
-_Row = Annotated[list[float], pydantic.Field(min_length=1)]
-
-
-def _field(metric: metrics.Metric) -> tuple[Any, Any]:
-    kind: Any = _Row if metric.axis else metrics.Interval
-    return (kind | None, None) if metric.loop else (kind, ...)
-
-
-_FIELDS: Arguments = {name: _field(metric) for name, metric in metrics.METRICS.items()}
-EVALUATED = pydantic.create_model("EVALUATED", **_FIELDS)
-
-
-class Evaluation(pydantic.BaseModel):
-    """The JSON of an evaluation."""
-
-    policies: dict[str, EVALUATED]  # type: ignore[valid-type]
-    quantiles: dict[str, Quantiles]
-
-    @pydantic.model_validator(mode="after")
-    def _paired(self) -> "Evaluation":
-        if missing := sorted(self.policies.keys() - self.quantiles.keys()):
-            raise ValueError(f"quantiles of {missing} are missing")
-        return self
 
 
 @dataclass(frozen=True)
@@ -187,8 +152,38 @@ def evaluation_report(
     }
 
 
+def _evaluation() -> Any:
+    """Return the model of the JSON of an evaluation."""
+    # Imported here, because pydantic takes a tenth of a second to load.
+    import pydantic
+
+    row = Annotated[list[float], pydantic.Field(min_length=1)]  # an interval, or a list
+
+    def kind(metric: metrics.Metric) -> tuple[Any, Any]:
+        own: Any = row if metric.axis else metrics.Interval
+        return (own | None, None) if metric.loop else (own, ...)
+
+    columns: Arguments = {name: kind(metric) for name, metric in metrics.METRICS.items()}
+    policy: Any = pydantic.create_model("EVALUATED", **columns)
+    quantiles: Any = pydantic.create_model("Quantiles", median=(float, ...))
+
+    class Evaluation(pydantic.BaseModel):
+        policies: dict[str, policy]
+        quantiles: dict[str, quantiles]
+
+        @pydantic.model_validator(mode="after")
+        def _paired(self) -> "Evaluation":
+            if missing := sorted(self.policies.keys() - self.quantiles.keys()):
+                raise ValueError(f"quantiles of {missing} are missing")
+            return self
+
+    return Evaluation
+
+
 def finished(path: Path | None, report: Plain) -> Plain:
     """Return the JSON of an earlier run of the same evaluation."""
+    from fusion_gym.training.config import checked
+
     if path is None:
         raise ConfigurationError("resume = True is not allowed without json: there is no file")
     if not path.exists():
@@ -196,5 +191,5 @@ def finished(path: Path | None, report: Plain) -> Plain:
     earlier = read_json(path, "json")
     now, then = ({key: item.get(key) for key in _INPUTS} for item in (report, earlier))
     check_inputs(now, then, f"json {str(path)!r}")
-    checked(Evaluation, earlier, f"json = {str(path)!r}")
+    checked(_evaluation(), earlier, f"json = {str(path)!r}")
     return earlier

@@ -20,9 +20,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event, Thread
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
-import joblib
 import numpy as np
 import tyro
 
@@ -34,13 +33,13 @@ from fusion_gym.output import files
 from fusion_gym.output.ending import ended_like_by_ctrl_c
 from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.policies.registry import parse_settings, parse_value
-from fusion_gym.recordings import Recording, field_report, field_study, fit, fitting
-from fusion_gym.recordings.field_report import DeviceName, FieldReport
-from fusion_gym.recordings.field_study import METHODS, PRACTICE, FieldStudy, MethodPoint, scale
-from fusion_gym.recordings.recording import SHIPPED
-from fusion_gym.training.config import Experiment
+from fusion_gym.recordings import DeviceName
 from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import number, refusal
+
+if TYPE_CHECKING:
+    from fusion_gym.recordings.field_study import FieldStudy, MethodPoint, Work
+    from fusion_gym.training.config import Experiment
 
 AGENT = "agent"
 _WINDOWS, _LONGEST, _SHORTEST = 60, 300, 20  # windows at least, and steps of a window
@@ -76,6 +75,14 @@ class Field(FitOptions, Long):
 
     def run(self) -> None:
         """Fit, tune, train, measure and report."""
+        # Imported here, because pandas and matplotlib take a second to load.
+        import joblib
+
+        from fusion_gym.recordings import Recording, field_report, field_study, fit, fitting
+        from fusion_gym.recordings.field_report import FieldReport
+        from fusion_gym.recordings.field_study import PRACTICE, FieldStudy, MethodPoint, scale
+        from fusion_gym.recordings.recording import SHIPPED
+
         whole = Recording.read(self.log, **self.reading)
         recording = self.select(whole)
         if self.tolerance and self.target_rate is not None:
@@ -152,8 +159,13 @@ class Field(FitOptions, Long):
             print(field_report.write_report(report, self.output))
             shutil.rmtree(self.output / "trials", ignore_errors=True)
 
-    def measure_methods(self, study: FieldStudy) -> dict[str, Path]:
+    def measure_methods(self, study: "FieldStudy") -> dict[str, Path]:
         """Measure the methods that the folder lacks, and return the files of all."""
+        import joblib
+
+        from fusion_gym.recordings import field_study
+        from fusion_gym.recordings.field_study import METHODS
+
         names = sorted([*METHODS, AGENT], key=lambda name: name != AGENT and not METHODS[name][1])
         paths = {name: self.output / f"{name.replace(', ', '_').replace(' ', '_')}.json"
                  for name in [*METHODS, AGENT]}  # fmt: skip
@@ -194,7 +206,7 @@ def tolerances(words: Sequence[str], names: Sequence[str]) -> tuple[float, ...]:
 
 
 def _progress(
-    study: FieldStudy, paths: Mapping[str, Path], work: Mapping[str, field_study.Work]
+    study: "FieldStudy", paths: Mapping[str, Path], work: Mapping[str, "Work"]
 ) -> tuple[int, str]:
     """Return the simulated steps that the folder holds, and the present stage of each method."""
     done, stages = 0, []
@@ -211,8 +223,10 @@ def _progress(
     return done, "; ".join(stages)
 
 
-def _measure(study: FieldStudy, name: str, path: Path, folder: Path, timesteps: int) -> str:
+def _measure(study: "FieldStudy", name: str, path: Path, folder: Path, timesteps: int) -> str:
     """Measure one method, and write its points."""
+    from fusion_gym.recordings import field_study
+
     own, study = name == AGENT, replace(study, trials=cast(Path, study.trials) / path.stem)
     points = (
         train_agent(study, folder / "agent", timesteps) if own else field_study.measure(study, name)
@@ -221,8 +235,12 @@ def _measure(study: FieldStudy, name: str, path: Path, folder: Path, timesteps: 
     return name
 
 
-def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodPoint]:
+def train_agent(study: "FieldStudy", folder: Path, timesteps: int) -> "list[MethodPoint]":
     """Train a centralised scheduler, and measure it at five prices."""
+    from fusion_gym.recordings import field_study
+    from fusion_gym.recordings.field_study import scale
+    from fusion_gym.training.config import Experiment
+
     free = replace(study, tolerance=())
     sizes = (scale(free, "centralised", np.ones(1), factor) for factor in (0.7, 1.4))
     few, many = (
@@ -247,7 +265,7 @@ def train_agent(study: FieldStudy, folder: Path, timesteps: int) -> list[MethodP
     return field_study.measured(study, rules, None if study.tolerance else len(rules) // 2)
 
 
-def train_model(study: FieldStudy, experiment: Experiment, folder: Path) -> None:
+def train_model(study: "FieldStudy", experiment: "Experiment", folder: Path) -> None:
     """Train the model of an experiment in a folder, or continue its training."""
     if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
         raise KeyboardInterrupt

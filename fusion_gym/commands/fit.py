@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-import yaml
 
 from fusion_gym.commands.command_line import Command, OutputFile, between
 from fusion_gym.errors import refusal
@@ -110,6 +109,8 @@ class Fit(FitOptions, Command):
 
 def plant_text(plant: "FittedPlant", recording: "Recording", log: str, rows: int) -> str:
     """Return the option file of a plant that was fitted to the first rows of a log."""
+    import yaml
+
     source = f"# {Path(log).name}, the first {rows:,} steps of {recording.interval}"
     units = "; ".join(f"{c.name} [{c.unit}]" for c in recording.channels)
     text = yaml.safe_dump(plant.options, sort_keys=False, default_flow_style=None)

@@ -10,7 +10,7 @@ shows the page of an entry.
 import itertools
 import re
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from textwrap import shorten
@@ -22,16 +22,16 @@ from rich.table import Table
 
 from fusion_gym import zoo
 from fusion_gym.commands.command_line import Command
-from fusion_gym.core.knowledge import MEANING
+from fusion_gym.core import code_cache
+from fusion_gym.core.knowledge import MEANING, Signal
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import short
 from fusion_gym.envs.pages import page
-from fusion_gym.envs.registration import ENVIRONMENTS, make_task, options_of
+from fusion_gym.envs.registration import ENVIRONMENTS, build_of, make_task, options_of
 from fusion_gym.evaluation.metrics import METRICS
 from fusion_gym.fusion.table import RULES
 from fusion_gym.output.tables import console
 from fusion_gym.policies.registry import policy_maker, policy_names
-from fusion_gym.training.config import SHIPPED, TABLE
 from fusion_gym.validation import keys
 
 
@@ -58,14 +58,9 @@ CATALOGUE: dict[str, Callable[[], dict[str, Entry]]] = {
     "metrics": lambda: {
         name: Entry(row.meaning, partial(str, row.meaning)) for name, row in METRICS.items()
     },
-    "algorithms": lambda: {
-        name: Entry(row.meaning, partial(_settings, name)) for name, row in TABLE.items()
-    },
+    "algorithms": lambda: _algorithms(),
     "zoo": lambda: {name: _agent(name) for name in zoo.names()},
-    "configs": lambda: {
-        path.stem: _config(path.read_text(encoding="utf-8"))
-        for path in sorted(SHIPPED.glob("*.yaml"))
-    },
+    "configs": lambda: _configs(),
 }
 
 
@@ -89,8 +84,7 @@ def _page(owner: Any, meaning: str) -> str:
 
 
 def _environment(env_id: str) -> str:
-    signals = make_task(env_id).estimator.signals
-    rows = [(f"`{s.name}`", s.axes, s.knowledge, s.meaning) for s in signals]
+    rows = [(f"`{s.name}`", s.axes, s.knowledge, s.meaning) for s in _signals_of(env_id)]
     head = ("signal", "axes", "known to", "meaning")
     return f"{page(env_id)}\n## Signals\n{table(head, rows)}\n"
 
@@ -114,11 +108,20 @@ def _classes(places: Mapping[type, list[str]]) -> str:
     )
 
 
+def _signals_of(env_id: str) -> Sequence[Signal]:
+    """Return the signals of an environment, whose task may take a second to make."""
+
+    def declared() -> Sequence[Signal]:
+        return make_task(env_id).estimator.signals
+
+    return code_cache.stored("signals", (env_id, build_of(env_id)), declared)
+
+
 def _signals() -> dict[str, Entry]:
     """Return the signals of all environments, each with its environments."""
     rows: dict[str, list[tuple[str, ...]]] = {}
     for env_id in ENVIRONMENTS:
-        for signal in make_task(env_id).estimator.signals:
+        for signal in _signals_of(env_id):
             known, place = MEANING[signal.knowledge], env_id.rpartition("/")[2]
             row = (place, signal.axes, known, signal.meaning)
             rows.setdefault(signal.name, []).append(row)
@@ -126,9 +129,15 @@ def _signals() -> dict[str, Entry]:
     return {name: Entry(where[0][-1], partial(table, head, where)) for name, where in rows.items()}
 
 
-def _settings(name: str) -> str:
+def _algorithms() -> dict[str, Entry]:
+    # Imported here, because pydantic takes a tenth of a second to load.
+    from fusion_gym.training.config import TABLE
+
+    return {name: Entry(row.meaning, partial(_settings, name, row)) for name, row in TABLE.items()}
+
+
+def _settings(name: str, row: Any) -> str:
     """Return the settings of an algorithm with their defaults."""
-    row = TABLE[name]
     fields = row.config(name=name).model_dump(exclude={"name"})
     rows = [(f"`{name}`", short(value)) for name, value in fields.items()]
     return f"{row.meaning}; {row.source}\n\n{table(('setting', 'default'), rows)}\n"
@@ -142,6 +151,12 @@ def _agent(name: str) -> Entry:
     rows = [(f"{p:.3g}", *(f"{point[name]:.4g}" for name in names)) for p, point in points]
     where, head = f"{card['env']} {options}", ("price of a token", "cost", "MSE", "tokens a step")
     return Entry(where, lambda: f"{where}\n\n{table(head, rows)}\n")
+
+
+def _configs() -> dict[str, Entry]:
+    from fusion_gym.training.config import SHIPPED
+
+    return {path.stem: _config(path.read_text("utf-8")) for path in sorted(SHIPPED.glob("*.yaml"))}
 
 
 def _config(text: str) -> Entry:

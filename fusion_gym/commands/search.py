@@ -31,7 +31,6 @@ from fusion_gym.evaluation import rule_search
 from fusion_gym.output import tables
 from fusion_gym.output.files import check_inputs, folder_refusal, lock_folder, read_json, write
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.training.config import checked
 from fusion_gym.validation import ConfigurationError
 
 _GENERATIONS, _RESULT = "generations.json", "search.json"
@@ -106,6 +105,9 @@ class Search(EnvironmentOptions, Long):
 
     def earlier(self, inputs: Plain) -> list[rule_search.Generation]:
         """Return the generations in the folder, of the same search."""
+        # Imported here, because pydantic takes a tenth of a second to load.
+        from fusion_gym.training.config import checked
+
         path = self.output / _GENERATIONS
         if not self.resume:
             if path.exists() or (self.output / _RESULT).exists():

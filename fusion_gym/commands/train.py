@@ -24,7 +24,7 @@ import re
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from fusion_gym.commands.command_line import (
     OUTPUT_FOLDER,
@@ -36,9 +36,11 @@ from fusion_gym.commands.command_line import (
 )
 from fusion_gym.errors import forbidden
 from fusion_gym.policies.registry import parse_settings
-from fusion_gym.training.config import Experiment, checked, load_checked
 from fusion_gym.training.run import holds_training, train
 from fusion_gym.validation import ConfigurationError
+
+if TYPE_CHECKING:
+    from fusion_gym.training.config import Experiment
 
 TIMESTEPS = 1_000_000  # of a training without a config
 
@@ -64,7 +66,7 @@ class Train(Long):
     resume: bool = False
     """Continue from the last checkpoint; resume only your own, since it contains pickles."""
 
-    def experiment(self) -> Experiment:
+    def experiment(self) -> "Experiment":
         """Return the config with the options of the command line, checked again."""
         return self._base_experiment().changed(
             self.output,
@@ -73,8 +75,11 @@ class Train(Long):
             seed=self.seed,
         )
 
-    def _base_experiment(self) -> Experiment:
+    def _base_experiment(self) -> "Experiment":
         """Return the config, or the default config of ``env`` and ``algorithm``."""
+        # Imported here, because pydantic takes a tenth of a second to load.
+        from fusion_gym.training.config import Experiment, checked, load_checked
+
         if (self.config is None) == (self.env is None):
             raise forbidden("config", self.config, "give one of them", f"with env = {self.env!r}")
         if self.config is not None:

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Generic, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.declaration import NumpyOnly, OptionGroup
 from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.namespace import ndtr
 
 # Option of each row of a departure, and the reason why an environment may refuse it.
 DEPARTURES = {

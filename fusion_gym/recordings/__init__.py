@@ -1,6 +1,6 @@
 """Logs of sensors: data cards, fitted plants, an environment, and the study of their reports."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from fusion_gym.importing import require
 
@@ -8,6 +8,8 @@ if TYPE_CHECKING:
     from fusion_gym.recordings.card import ChannelCard, RecordedChannel
     from fusion_gym.recordings.fitting import Criticism, FittedPlant, criticise, fit
     from fusion_gym.recordings.recording import Recording
+
+DeviceName = Literal["zigbee", "bacnet", "esphome"]
 
 __all__ = [
     "ChannelCard",

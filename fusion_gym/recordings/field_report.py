@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -26,7 +26,7 @@ from fusion_gym.output.figures import save_figure
 from fusion_gym.output.files import write_text
 from fusion_gym.output.palette import BLUE, READABLE, VERMILLION
 from fusion_gym.output.tables import table_tables
-from fusion_gym.recordings import ChannelCard, Criticism, Recording, field_study
+from fusion_gym.recordings import ChannelCard, Criticism, DeviceName, Recording, field_study
 from fusion_gym.recordings.field_study import METHODS, PRACTICE, MethodPoint, MethodResult
 from fusion_gym.version import __version__
 
@@ -96,7 +96,6 @@ def card_row(card: ChannelCard) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-DeviceName = Literal["zigbee", "bacnet", "esphome"]
 # Shortest and longest interval in seconds, and the meaning of the fields with its source.
 DEVICES: dict[str, tuple[float, float, str]] = {
     "zigbee": (1.0, 65_534.0, "whole seconds, and steps of the attribute MeasuredValue "

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
@@ -349,6 +348,9 @@ def lagrangian_bound(
     Raises:
         ConfigurationError: a value that is not allowed.
     """
+    # Imported here, because scipy.optimize takes a tenth of a second to load.
+    from scipy.optimize import minimize_scalar
+
     if any(len(problem.tokens.level) > 1 for problem in problems):
         reason = "only its price must limit each source"
         raise forbidden("tokens", "limited", reason, "in the parts of the bound")

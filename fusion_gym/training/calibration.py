@@ -31,7 +31,6 @@ from fusion_gym.policies.saved import (
 
 MIXTURES = 0.0, 0.5, 1.0
 THRESHOLDS = -2.4, -0.8, -0.3, -0.1, 0.1, 0.3, 0.8
-EPISODES = 16, 400  # of all candidates, and of the best, the rule and the agents
 BEST = 4  # candidates of the last round
 ERRORS = 2.0  # standard errors by which another candidate must be cheaper than the rule
 _LANES = 4096  # runs in one batch

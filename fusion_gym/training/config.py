@@ -22,6 +22,7 @@ from fusion_gym.entries import Arguments, Options, Plain
 from fusion_gym.envs.registration import open_options
 from fusion_gym.errors import display
 from fusion_gym.importing import import_named
+from fusion_gym.training import EPISODES
 from fusion_gym.validation import choice
 from fusion_gym.yaml_text import parsed
 
@@ -371,7 +372,7 @@ class ValidationConfig(Strict):
 class CalibrationConfig(Strict):
     """Calibration after a training at drawn prices: tuning episodes of the first and last round."""
 
-    episodes: tuple[Positive, Positive] = (16, 400)
+    episodes: tuple[Positive, Positive] = EPISODES
 
 
 class Experiment(Strict):

@@ -1,6 +1,7 @@
 """How commands are called: options, help, errors in one line, configs by their name."""
 
 import dataclasses
+import os
 import re
 import shlex
 import subprocess
@@ -20,10 +21,10 @@ import fusion_gym
 from agents.benchmark.command import Benchmark
 from fusion_gym.commands import __main__ as everything
 from fusion_gym.commands import command_line
-from fusion_gym.commands.info import plain_text
 from fusion_gym.commands.list import catalogue
 from fusion_gym.commands.train import Train
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
+from fusion_gym.output.plain_text import plain_text
 from fusion_gym.policies.saved import ALGORITHMS
 from fusion_gym.training.config import TABLE, Experiment, checked, config_path, load_checked
 
@@ -190,3 +191,31 @@ def test_every_algorithm_can_be_loaded_by_its_name() -> None:
         experiment = checked(Experiment, plain, "config 'test'")
         assert type(experiment.algorithm) is row.config
         assert checked(Experiment, experiment.model_dump(), "config 'test'") == experiment
+
+
+def test_help_list_and_info_load_no_heavy_package(tmp_path: Path) -> None:
+    """Help takes half a second of processor time, the list a second and a page 1.5."""
+    lines = """
+import sys
+from fusion_gym.commands import __main__ as commands
+
+def run(*words):
+    sys.argv = ["fusion-gym", *words]
+    try:
+        commands.main()
+    except SystemExit as end:
+        assert not end.code, words
+
+heavy = {"jax", "joblib", "llvmlite", "matplotlib", "pandas", "stable_baselines3", "statsmodels"}
+heavy |= {"scipy.stats", "torch"}
+for name in commands.COMMANDS:
+    run(name, "--help")
+    own = {"pydantic", "pylatexenc", "rich.markdown", "scipy.linalg", "scipy.special", "yaml"}
+    assert not (heavy | own) & sys.modules.keys(), name
+for words in (["list"], ["info", "fusion_gym/LinearFusion-v2"]):
+    run(*words)
+    assert not heavy & sys.modules.keys(), words
+"""
+    home = os.environ | {"HOME": str(tmp_path)}
+    for part in ("import fusion_gym.commands.list as own; own.catalogue()", lines):
+        subprocess.run([sys.executable, "-c", part], env=home, check=True, stdout=subprocess.PIPE)

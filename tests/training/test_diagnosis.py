@@ -14,8 +14,9 @@ from training_configs import ENV, SMALL, read_records, small_config
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.callbacks import PriceRecord, threshold_costs, warn_of_silence
 from fusion_gym.training.config import TABLE, Experiment, load_checked
-from fusion_gym.training.run import PriceRecord, threshold_costs, train, warn_of_silence
+from fusion_gym.training.run import train
 
 FRONT = {"filter": "tobit", "horizon": 20, "cost_weight": "random", "price_range": [0.01, 0.32]}
 COUNTERFACTUAL = {"n_steps": 8, "batch_size": 32, "n_epochs": 1}

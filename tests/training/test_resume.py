@@ -138,7 +138,7 @@ def test_the_best_model_outlives_a_kill_between_its_validation_and_the_checkpoin
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=512)
     folder = Path(experiment.output)
     with monkeypatch.context() as patch:
-        patch.setattr("fusion_gym.training.run.Progress._write_records", die_with_records(2))
+        patch.setattr("fusion_gym.training.callbacks.Progress._write_records", die_with_records(2))
         with pytest.raises(Killed):
             run.train(experiment, quiet=True)
     assert (folder / "best_model.zip").exists()
@@ -193,7 +193,7 @@ def test_two_trainings_in_one_folder_are_refused(
             tried.append(str(caught.value))
         return ""
 
-    monkeypatch.setattr("fusion_gym.training.run.log_line", log_line)
+    monkeypatch.setattr("fusion_gym.training.callbacks.log_line", log_line)
     run.train(experiment, quiet=True)
     assert len(tried) == 2
 
