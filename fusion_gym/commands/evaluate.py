@@ -164,12 +164,12 @@ def _evaluation() -> Any:
         return (own | None, None) if metric.loop else (own, ...)
 
     columns: Arguments = {name: kind(metric) for name, metric in metrics.METRICS.items()}
-    policy: Any = pydantic.create_model("EVALUATED", **columns)
-    quantiles: Any = pydantic.create_model("Quantiles", median=(float, ...))
+    evaluated: Any = pydantic.create_model("EVALUATED", **columns)
+    spread: Any = pydantic.create_model("Quantiles", median=(float, ...))
 
     class Evaluation(pydantic.BaseModel):
-        policies: dict[str, policy]
-        quantiles: dict[str, quantiles]
+        policies: dict[str, evaluated]
+        quantiles: dict[str, spread]
 
         @pydantic.model_validator(mode="after")
         def _paired(self) -> "Evaluation":

@@ -29,7 +29,6 @@ from fusion_gym.policies.saved import (
     save_calibrated,
     tag_model,
 )
-from fusion_gym.training import run
 from fusion_gym.training.calibration import _choice, calibrate, fit_slopes
 from fusion_gym.training.config import Experiment, load_checked
 from fusion_gym.training.run import train
@@ -299,7 +298,7 @@ def test_a_failed_calibration_ends_the_training_with_its_error(
     def fail(*_: Any) -> None:
         raise ConfigurationError("a failure")
 
-    monkeypatch.setattr(run, "calibrate", fail)
+    monkeypatch.setattr("fusion_gym.training.calibration.calibrate", fail)
     with pytest.raises(ConfigurationError, match="a failure"):
         trained(tmp_path)
 

@@ -335,7 +335,7 @@ class CensoredEstimator(
         if sensors.unlimited:  # these two would say nothing
             blocks = [block for block in blocks if block.name not in _OF_CENSORING]
         if self.independent_nodes:
-            blocks[-2:] = (replace(block, node="hidden") for block in blocks[-2:])
+            blocks = blocks[:-2] + [replace(block, node="hidden") for block in blocks[-2:]]
         return tuple(blocks)
 
     def start(self, measurement: Array, announcement: Any) -> CensoredEstimate:
