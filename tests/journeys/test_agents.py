@@ -25,6 +25,7 @@ from fusion_gym.evaluation.metrics import METRICS
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run as train
 from fusion_gym.training.config import TABLE, Experiment, SweepSettings, load_checked
+from fusion_gym.validation import ConfigurationError
 
 CONFIGS = ROOT / "configs"
 EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "\ntraining:" in f.read_text()]
@@ -144,7 +145,7 @@ def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
 
 def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the demo's agents, with short episodes and small batches."""
-    for name, config in demo.CONFIGS.items():
+    for name, config in demo.CONFIGS.items():  # the process beside trains with its own config
         content = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())
         content["environment"]["options"] |= {"horizon": 10, "price_range": [0.01, 1.0]}
         content["training"]["num_envs"] = content["validation"]["episodes"] = 16
@@ -167,4 +168,33 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
         for row in rows:
             assert f"{row['policies']['model:calibrated_model.zip']['mean']:.4g}" in printed
     assert "--resume" in refusal("demo", words)
-    succeed("demo", [*words, "--resume"])
+    succeed("demo", [*words, "--resume", "--only", "tobit_oscillator"])
+
+
+def test_an_interrupted_demo_ends_both_trainings(tmp_path: Path) -> None:
+    """With a checkpoint of each, also if only the command receives the signal."""
+    command = [sys.executable, "-m", "fusion_gym.commands", "demo", "--output", str(tmp_path)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    folders = [tmp_path / name / "agent" for name in demo.CONFIGS]
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if all((folder / "validation.jsonl").exists() for folder in folders):
+            break
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGTERM)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error.decode().rstrip().endswith("--resume")
+    for folder in folders:
+        assert (folder / "latest.zip").exists()
+        assert not json.loads((folder / "summary.json").read_text())["finished"]
+
+
+def test_a_failed_process_of_the_demo_names_its_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["program", f"--output={tmp_path}", "--episodes=0"])
+    process = demo.Demo(output=tmp_path).process("linear_fusion")
+    with pytest.raises(ConfigurationError, match=r"demo\.log"), process:
+        pass
+    assert "episodes" in (tmp_path / "linear_fusion" / "demo.log").read_text()
