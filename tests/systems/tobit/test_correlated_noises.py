@@ -111,7 +111,7 @@ def test_the_bounds_floor_counts_what_is_shared() -> None:
     [
         ({"joint_measurement_covariance": np.ones((4, 4))}, "positive definite"),
         ({"filter": "kalman", "fusion": "federated"}, "'ci' or 'sci'"),
-        ({"filter": "adf"}, "'joint' or 'kalman'"),
+        ({"filter": "adf"}, "'joint', 'local' or 'kalman'"),
         ({"memory": True, "memory_filter": "adf"}, "memory_filter"),
         ({"filter": "joint", "fusion": "ci"}, "a filter with nodes"),
         ({"censoring_threshold": [0.0, -np.inf, -np.inf]}, "because some are censored"),
