@@ -171,6 +171,7 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
     succeed("demo", [*words, "--resume", "--only", "tobit_oscillator"])
 
 
+@pytest.mark.slow
 def test_an_interrupted_demo_ends_both_trainings(tmp_path: Path) -> None:
     """With a checkpoint of each, also if only the command receives the signal."""
     command = [sys.executable, "-m", "fusion_gym.commands", "demo", "--output", str(tmp_path)]
