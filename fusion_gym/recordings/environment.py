@@ -210,6 +210,9 @@ def build_recorded(choice: RecordedFusionOptions) -> Scenario:
         raise forbidden("input_matrix", choice.input_matrix, reason, "with a recording")
     if choice.log is None:
         choice = _example(choice)
+    if (joint := choice.joint_measurement_covariance) is not None:
+        reason = "the noises of a fitted plant are independent"
+        raise forbidden("joint_measurement_covariance", joint, reason, "with a recording")
     if not isinstance(choice.log, str | os.PathLike):
         raise refusal("log", choice.log, "the path of a CSV file")
     share = number("fit_share", choice.fit_share, above=0.0, at_most=0.95)

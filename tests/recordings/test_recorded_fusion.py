@@ -266,6 +266,7 @@ def test_what_is_no_recording_of_the_plant_is_refused(log: str) -> None:
         ({"process_covariance": [[1.0, 1.0], [1.0, 1.0]]}, "process noise of its own"),
         ({"horizon": 2000}, "this part of the log has 1,500 steps"),
         ({"true_process_noise": 2.0}, "the truth is the recording"),
+        ({"joint_measurement_covariance": [[1.0, 0.5], [0.5, 1.0]]}, "noises .* are independent"),
         ({"fit_share": 1.0}, "fit_share = 1.0"),
         ({"log": 3}, "^log = 3 is not allowed"),
     ]
