@@ -1,10 +1,10 @@
 """Environment steps per second on one processor, everything included, beside the alternatives.
 
-    python -m benchmarks.throughput [--seconds 0.1] [--page]
+    python -m benchmarks.throughput [--seconds 0.1] [--gpu] [--page]
 
 All cells are measured in one run, in turns, and each is the median of its turns. The last column is
-the ratio to ``oscillator.c``, where a C compiler is at hand. ``--page`` writes the table into
-docs/speed.md.
+the ratio to ``oscillator.c``, where a C compiler is at hand. ``--gpu`` measures the pure functions
+on a GPU instead. ``--page`` writes the table into docs/speed.md.
 """
 
 import itertools
@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 PAGE = Path(__file__).parent.parent / "docs" / "speed.md"
 LOOP = Path(__file__).with_name("oscillator.c")
-TURNS, RUNS = 9, (1, 64, 1024)
+TURNS, RUNS, GPU_RUNS = 9, (1, 64, 1024), (1024, 65_536, 524_288)
 RULE = "innovation_threshold:threshold=1.1"
 OPTIONS: tuple[tuple[str, Options], ...] = (
     ("TobitOscillator-v1", {}),
@@ -55,16 +55,22 @@ OTHERS: tuple[tuple[str, Options], ...] = (
     ("UnknownInput-v1", {"filter": "paper"}),
     ("BiasedOscillator-v2", {"filter": "adf"}),
 )
+GPU: tuple[tuple[str, Options], ...] = (
+    *OPTIONS,
+    *((name, {}) for name in ("CorrelatedTracking-v1", "MarkovJumpTracking-v1", "UnknownInput-v1")),
+)
 # A workload takes seconds and returns environment steps per second.
 Workload = Callable[[float], float]
 
 
-def timed(step: Callable[[], object], steps_per_call: int) -> Workload:
+def timed(
+    step: Callable[[], object], steps_per_call: int, clock: Callable[[], float] = time.process_time
+) -> Workload:
     """Return the workload of a function that makes some steps."""
 
     def run(seconds: float) -> float:
-        calls, began = 0, time.process_time()
-        while (elapsed := time.process_time() - began) < seconds:
+        calls, began = 0, clock()
+        while (elapsed := clock() - began) < seconds:
             step()
             calls += 1
         return calls * steps_per_call / elapsed
@@ -95,7 +101,9 @@ def _workload(env: Any, runs: int, step: Callable[[Any], object]) -> Workload:
     return timed(lambda: step(next(actions)), runs)
 
 
-def scan(env_id: str, options: Options, runs: int) -> Workload:
+def scan(
+    env_id: str, options: Options, runs: int, clock: Callable[[], float] = time.process_time
+) -> Workload:
     """100 steps of pure functions under ``jax.lax.scan``, with a rule, noise and resets."""
     env, params = fusion_gym.jax.make(env_id, **options)
     rule = fusion_gym.make_policy(RULE, env.task)
@@ -115,7 +123,7 @@ def scan(env_id: str, options: Options, runs: int) -> Workload:
 
     keys = jax.random.split(jax.random.key(0), runs)
     states = jax.vmap(env.reset, (0, None))(keys, params)[1]
-    return timed(lambda: jax.block_until_ready(episodes(states, keys[0])), 100 * runs)
+    return timed(lambda: jax.block_until_ready(episodes(states, keys[0])), 100 * runs, clock)
 
 
 def sb3(env_id: str, options: Options, runs: int, native: bool = True) -> Workload:
@@ -219,13 +227,8 @@ def _label(name: str, options: Options) -> str:
     return f"{name}, {given}" if given else name
 
 
-def main(seconds: float = 0.1, page: bool = False) -> None:
-    """Measure all rows and print the table.
-
-    Args:
-        seconds: of each cell and turn.
-        page: write docs/speed.md.
-    """
+def measure_cpu(seconds: float) -> str:
+    """Return the table of all interfaces on one core."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
     with tempfile.TemporaryDirectory() as folder:
@@ -241,15 +244,52 @@ def main(seconds: float = 0.1, page: bool = False) -> None:
     for label, kind, by_runs in every:
         median = {runs: next(medians) for runs in by_runs}
         reference = median[1024] if kind == "C loop" else reference
-        cells = (f"{float(f'{median[r]:.3g}'):,.0f}" if r in median else "" for r in RUNS)
+        cells = (_rounded(median[r]) if r in median else "" for r in RUNS)
         ratio = f"{median[1024] / reference:.2f}" if reference and 1024 in median else ""
         lines.append((label, kind, *cells, ratio))
-    counts = (f"{runs:,} runs" for runs in RUNS[1:])
-    heads = "environment", "interface", "1 run", *counts, "1,024 to C"
-    text = f"{table(heads, lines)}\n\nMeasured in fusion-gym {fusion_gym.__version__}."
+    heads = "environment", "interface", "1 run", *map(_runs, RUNS[1:]), "1,024 to C"
+    return f"{table(heads, lines)}\n\nMeasured in fusion-gym {fusion_gym.__version__}."
+
+
+def measure_gpu(seconds: float, sizes: Iterable[int] = GPU_RUNS) -> str:
+    """Return the table of the pure functions for each number of runs, on the device of JAX."""
+    lines, sizes = [], tuple(sizes)
+    for name, options in track(GPU, "environments"):
+        cells, slowest = [], 0.0
+        for runs in sizes:
+            began = time.perf_counter()
+            workload = scan(f"fusion_gym/{name}", options, runs, time.perf_counter)
+            workload(1e-9)
+            slowest = max(slowest, time.perf_counter() - began)
+            cells.append(_rounded(np.median([workload(seconds) for _ in range(TURNS)])))
+        lines.append((_label(name, options), *cells, f"{slowest:.0f}"))
+    heads = "environment", *map(_runs, sizes), "first call (s)"
+    device = jax.devices()[0].device_kind
+    return f"{table(heads, lines)}\n\n{device}, in fusion-gym {fusion_gym.__version__}."
+
+
+def _rounded(number: float) -> str:
+    return f"{float(f'{number:.3g}'):,.0f}"
+
+
+def _runs(count: int) -> str:
+    return f"{count:,} runs"
+
+
+def main(seconds: float = 0.1, gpu: bool = False, page: bool = False) -> None:
+    """Measure all rows and print the table.
+
+    Args:
+        seconds: of each cell and turn.
+        gpu: measure the pure functions on a GPU.
+        page: write docs/speed.md.
+    """
+    if gpu and (platform := jax.devices()[0].platform) == "cpu":
+        raise SystemExit(f"--gpu is not allowed: JAX has the platform '{platform}', not a GPU")
+    text = measure_gpu(seconds) if gpu else measure_cpu(seconds)
     if page:
-        content = replaced(PAGE.read_text(encoding="utf-8"), "throughput", text)
-        PAGE.write_text(content, encoding="utf-8")
+        name = "gpu" if gpu else "throughput"
+        PAGE.write_text(replaced(PAGE.read_text(encoding="utf-8"), name, text), encoding="utf-8")
     Console(width=150).print(Markdown(text))
 
 

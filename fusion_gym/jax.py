@@ -264,7 +264,7 @@ class FunctionalEnv:
         price: Any = task.reward.price.draw(uniform)
         if params is not None and params.price is not None:
             price = params.price
-        first = jax.tree.map(jnp.asarray, start_of(task, start)[0])
+        first = _each_run(lambda own: start_of(task, own)[0], start)
         state = advance(task, first, noise, steps)
         prices = cast(Any, jnp.broadcast_to(price, steps.shape))
         position = Position(state, prices, steps, steps + task.horizon)
@@ -319,6 +319,12 @@ def _refuse_in_forks(owner: type, *methods: str) -> None:
 def _normals(keys: Any, channels: int) -> Any:
     """Return standard normals (channels, N) from N keys."""
     return jax.vmap(lambda key: jax.random.normal(key, (channels,)))(keys).T
+
+
+def _each_run(function: Callable[[Any], Any], noise: Any) -> Any:
+    """Return a state (…, N) of noise (channels, N), whose constants do not have N entries."""
+    states = jax.vmap(lambda own: function(own[:, None]), 1, -1)(noise)
+    return jax.tree.map(lambda x: x[..., 0, :], jax.lax.optimization_barrier(states))
 
 
 def _for_one_run(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -52,7 +52,9 @@ def set_at(array: Any, index: tuple[Any, ...], value: Any) -> Any:
         part.indices(size)[:2] if isinstance(part, slice) else (part % size, part % size + 1)
         for part, size in zip(index, sizes, strict=True)
     ]
-    mask = np.zeros(sizes, dtype=np.bool_)
+    # a mask of all runs would be a constant that grows with them
+    widths = [1 if span == (0, size) else size for span, size in zip(spans, sizes, strict=True)]
+    mask = np.zeros(widths, dtype=np.bool_)
     mask[tuple(slice(*span) for span in spans)] = True
     for axis, part in enumerate(index):
         if not isinstance(part, slice):

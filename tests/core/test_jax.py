@@ -18,6 +18,7 @@ import pytest
 from test_namespace import MORE_TASKS, TASKS
 
 import fusion_gym
+import fusion_gym.jax
 from fusion_gym.arrays import arrays_of
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
@@ -182,6 +183,26 @@ def test_an_episode_that_ends_is_reset() -> None:
     )
     assert bool(terminated)
     assert not bool(truncated)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), slowly(dict(TASKS).items(), "LinearFusion-v2", "RemoteEstimation-v1")
+)
+def test_programs_do_not_grow_with_the_number_of_runs(name: str, options: dict[str, Any]) -> None:
+    env, params = fusion_gym.jax.make(f"fusion_gym/{name}", **options)
+    action = np.zeros(env.action_space().shape, np.int64)
+
+    def lengths(runs: int) -> np.ndarray[Any, Any]:
+        keys = jax.random.split(jax.random.key(0), runs)
+        reset = jax.jit(jax.vmap(lambda key: env.reset(key, params)[1]))
+        step = jax.jit(jax.vmap(lambda key, state: env.step(key, state, action, params)))
+        states = jax.eval_shape(reset, keys)
+        programs = reset.lower(keys), step.lower(keys, states)
+        return np.array([len(program.as_text()) for program in programs])
+
+    runs = 16_384
+    arrays = 4 * 16 * runs  # hexadecimal digits of four numbers a run
+    assert (lengths(runs) < 1.2 * lengths(64) + arrays).all()
 
 
 def test_an_action_of_another_shape_is_refused() -> None:
