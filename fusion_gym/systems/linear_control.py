@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.linalg import LinAlgError, solve_discrete_are
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -118,8 +118,8 @@ def linear_controller(options: Any, transition: Array) -> tuple[LinearController
     if isinstance(options.gain, str):
         validation.choice("gain", options.gain, ("lqr",))
         try:
-            cost = solve_discrete_are(transition, matrix, state, control)
-        except (LinAlgError, ValueError):
+            cost = scipy.linalg.solve_discrete_are(transition, matrix, state, control)
+        except (np.linalg.LinAlgError, ValueError):
             reason = "it must reach every state that does not decay, and the weight must see it"
             raise forbidden("input_matrix", matrix, reason, "with gain='lqr'") from None
         both: Array = control + matrix.T @ cost @ matrix

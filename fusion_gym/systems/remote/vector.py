@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, block_diag, solve_discrete_are
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -69,8 +69,8 @@ class Source:
         """Return gain (n, m) and posterior covariance (n, n) of the steady Kalman filter."""
         a, w, c, r = (getattr(self, key) for key in KEYS)
         try:
-            prior = solve_discrete_are(a.T, c.T, w, r)
-        except (LinAlgError, ValueError) as error:
+            prior = scipy.linalg.solve_discrete_are(a.T, c.T, w, r)
+        except (np.linalg.LinAlgError, ValueError) as error:
             reason = "its sensor must measure every growing state, and noise must move every other"
             raise forbidden(field, a, reason) from error
         posterior = prior
@@ -135,7 +135,7 @@ class VectorSources(NormalPlant, AgedSources[Truth]):
         for row, size, end in zip(places, sizes, np.cumsum(sizes), strict=True):
             row[:size] = np.arange(end - size, end)
         nature = Nature.create(options, ("true_threshold_shift",))
-        whole = block_diag(*(source.transition for source in sources))
+        whole = scipy.linalg.block_diag(*(source.transition for source in sources))
 
         def radius(factor: float) -> float:
             still = np.eye(len(whole))

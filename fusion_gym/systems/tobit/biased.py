@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 
 from fusion_gym import validation
 from fusion_gym.core.access import AccessRule
@@ -195,6 +195,6 @@ def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPla
     inner = validation.array("bias_transition", options.bias_transition, (biases, biases))
     mean = validation.array("initial_mean", options.initial_mean, (states,))
     bias_mean = validation.array("bias_initial_mean", options.bias_initial_mean, (biases,))
-    mean, start = np.concatenate([mean, bias_mean]), block_diag(start, bias_start)
+    mean, start = np.concatenate([mean, bias_mean]), scipy.linalg.block_diag(start, bias_start)
     joint = np.block([[transition, gain if aware else 0.0 * gain], [np.zeros_like(gain.T), inner]])
-    return LinearPlant.create(joint, block_diag(process, noise), mean, start), states
+    return LinearPlant.create(joint, scipy.linalg.block_diag(process, noise), mean, start), states

@@ -8,8 +8,8 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, cast
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -236,12 +236,12 @@ def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
         variance[place, :size] = variances
         factors.append(factor)
     sensors = CensoredSensors.create(matrix, variance, low, states, high, present)
-    if whole is None or not np.count_nonzero(whole - block_diag(*own)):
+    if whole is None or not np.count_nonzero(whole - scipy.linalg.block_diag(*own)):
         return sensors
     if any(limited):
         allowed = "without correlations between sensors, because some are censored"
         raise validation.refusal(_JOINT, joint, allowed)
-    scale = block_diag(*factors) * np.sqrt(variance[present])
+    scale = scipy.linalg.block_diag(*factors) * np.sqrt(variance[present])
     factor, places = np.eye(present.size), np.flatnonzero(present)
     factor[np.ix_(places, places)] = np.linalg.solve(scale, np.linalg.cholesky(whole))
     return replace(sensors, noise_correlation=factor[..., None])

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.linalg import expm
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
@@ -53,9 +53,9 @@ def two_carts(step: float = 0.25) -> tuple[Array, Array, Array]:
     )
     force = np.array([[0.0], [1.0], [0.0], [0.0]])
     noise = density * np.diag([0.0, 1.0, 0.0, 1.0])
-    moved = expm(np.block([[drift, force], [np.zeros((1, 5))]]) * step)
+    moved = scipy.linalg.expm(np.block([[drift, force], [np.zeros((1, 5))]]) * step)
     # Van Loan's integral of exp(F t) G exp(F t)ᵀ
-    pair = expm(np.block([[-drift, noise], [np.zeros((4, 4)), drift.T]]) * step)
+    pair = scipy.linalg.expm(np.block([[-drift, noise], [np.zeros((4, 4)), drift.T]]) * step)
     process = pair[4:, 4:].T @ pair[:4, 4:]
     return moved[:4, :4], moved[:4, 4:], (process + process.T) / 2
 
