@@ -3,7 +3,7 @@
 Source: adaptive_innovation, Section 6.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -13,17 +13,18 @@ from scipy.stats import norm
 
 import fusion_gym
 from agents.papers import adaptive_innovation_runs as runs
+from agents.papers.adaptive_innovation_claims import claims
 from agents.papers.adaptive_innovation_runs import SENSORS, STEPS, Lane
 from agents.papers.drawing import legend, set_ticks, stack
-from agents.papers.numbers import Number, grid
-from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
+from agents.papers.numbers import Number, cite, grid
+from agents.papers.paper import Data, Paper, PaperFigure, Piece, PieceData, Settings
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals
+from fusion_gym.docstrings import table
 from fusion_gym.output import palette
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 
 STATES = ("position", "velocity", "acceleration")
-UNITS = ("m", "m/s", "m/s²")
 FUSIONS = ("sci", "sici")
 NAMES = {"sci": "SCI", "sici": "SICI"}
 INVERSES = {"sci": 3, "sici": 4}  # of matrices in (42) and (54) at a weight
@@ -67,7 +68,7 @@ def simulate_rates(episodes: int, seed: int, settings: Settings) -> Data:
     """Return rates (lanes, sensors, E); innovations and requests of the trigger, the first lane.
 
     ``changes`` (2, E): shares of the steps after a request, then after silence, in which a
-    threshold differs from the step before. ``levels`` (H, sensors) are the thresholds in force.
+    threshold differs from the step before.
     """
     rules = {
         OURS: None, PRINTED_SIGN: _replaced(sign=1.0), FIXED: _replaced(sensitivity=0.0),
@@ -92,9 +93,6 @@ def simulate_rates(episodes: int, seed: int, settings: Settings) -> Data:
     changes = [changed / np.maximum(count, 1) for changed, count in sums]
     return {
         "lanes": list(TRIGGERS), "rates": rates, "changes": np.array(changes),
-        "levels": levels[..., 0],
-        "ceiling": float(rule.threshold_after(np.zeros((len(SENSORS), 1))).max()),
-        "requested": first[..., 0].astype(np.int64),
     }  # fmt: skip
 
 
@@ -108,14 +106,13 @@ def _summarise_rates(data: Data) -> Data:
     levels = [runs.TriggerReading(sign=sign).threshold_after(size) for sign in (1.0, -1.0)]
     return {
         "tables": {"rates": numbers},
-        "steps": STEPS, "counts": [round(STEPS * printed) for printed in PRINTED],
+        "counts": [round(STEPS * printed) for printed in PRINTED],
         "away": [(100.0 * p - n.mean) / n.spread for p, n in zip(PRINTED, numbers, strict=True)],
         "usual": float(norm.ppf(0.5 + 0.5 * 0.95 ** (1.0 / len(numbers)))),
         "far": np.abs(percent[OURS].mean(-1) - 100.0 * np.array(PRINTED)).max(), "percent": percent,
         "agree": [number.verdict == "agrees" for number in numbers],
         "falls": [bool((np.diff(level) < 0.0).all()) for level in levels],
         "unmoved": float(np.ptp(runs.TriggerReading(sensitivity=0.0).threshold_after(size))),
-        "shares": data["requested"][WINDOW].mean(0),
     }  # fmt: skip
 
 
@@ -136,7 +133,7 @@ def _of_other_episodes(episodes: int) -> runs.RequestFunction:
 
 
 def simulate_fusion(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return the data of Figures 4 to 9 and their claims, by fusion rule.
+    """Return the data of the claims on Figures 4 to 9, by fusion rule.
 
     See :class:`ErrorRecord`. The lanes are the trigger at the bounds of the variances and at every
     noise scale, and two other policies at the bounds.
@@ -200,14 +197,14 @@ def _summarise_fusion(data: Data) -> Data:
         for lane, scale in scaled.items()
     }
     every, first = [AT_BOUND, *scaled], next(iter(scaled))
+    square, level = (lanes.both(name, AT_BOUND).sum(1).mean(-1) for name in ("square", "level"))
     per_step = ("mse_steps", "conservative_steps")
     at_bound = ("mse", "conservative", "square", "level", "beats", *per_step)
     return {
         "tables": {
             "traces": traces(names), "scales": traces(low_names), "inside": grid(STATES, rows),
         },
-        "quantities": list(quantities.values()), "states": STATES, "rules": list(NAMES.values()),
-        "runs": data["sci_mse"].shape[-1], "ellipses": runs.ELLIPSES,
+        "left": square / level, "rules": list(NAMES.values()),
         "late": lanes.both("mse_steps", AT_BOUND)[:, _LATE],
         "at": {name: lanes.both(name, AT_BOUND) for name in at_bound},
         "inside": lanes.means("inside", scaled),
@@ -237,42 +234,10 @@ def _relative(lanes: _Lanes, name: str, lane: str, other: str) -> Array:
 
 # --- figures --------------------------------------------------------------------------------------
 
-WINDOW = slice(299, 400)  # the steps of Figure 3
-_LATE = slice(399, 600)  # and of Figure 6
+_LATE = slice(399, 600)  # the steps of Figure 6
 _COLOURS = {"sci": palette.SKY, "sici": palette.FUSED}
-_DRAWN = 5  # steps from one point of a crowded line to the next
 _TIME = np.arange(1, STEPS + 1)
 _SUM = "sum over states (SI units)"
-
-
-def _draw_thresholds(figure: Any, data: Data) -> None:
-    time, requested = _TIME[WINDOW], data["requested"].astype(bool)[WINDOW]
-    axes = stack(figure, len(SENSORS), "step k", sharey=True)
-    for i, (axis, name) in enumerate(zip(axes, SENSORS, strict=True)):
-        colour, requests = palette.SENSORS[i], requested[:, i]
-        axis.step(time, data["levels"][WINDOW, i], where="mid", color=colour, lw=1.6)
-        axis.plot(time[requests], np.full(requests.sum(), 0.01), "|", color=palette.BLACK, ms=6)
-        axis.set_title(f"({'abc'[i]}) {name}", loc="left", color=colour)
-        axis.set_ylim(0.0, 1.02 * data["ceiling"] or 1.0)
-        axis.set_ylabel("θ (m²)" if i == 0 else "θ (m²/s²)" if i == 1 else "θ (m²/s⁴)")
-    axes[-1].set_xlim(time[0], time[-1])
-
-
-def _draw_tracking(figure: Any, data: Data) -> None:
-    lanes = _Lanes(data)
-    axes = stack(figure, 3, "step k")
-    for state, axis in enumerate(axes):
-        truth = lanes("sci", "truth", AT_BOUND)[:, state]
-        axis.plot(_TIME, truth, color=palette.TRUTH, lw=3.0, label="true value")
-        for fusion in FUSIONS:
-            axis.plot(
-                _TIME, lanes(fusion, "mean", AT_BOUND)[:, state], color=_COLOURS[fusion],
-                lw=2.0 if fusion == "sci" else 1.0, label=NAMES[fusion],
-            )  # fmt: skip
-        axis.set_title(f"({'abc'[state]}) {STATES[state]}", loc="left")
-        axis.set_ylabel(f"$x_{state + 1}$ ({UNITS[state]})")
-    axes[-1].set_xlim(0, STEPS)
-    legend(figure, axes[0], 3)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
@@ -306,69 +271,13 @@ def _draw_comparison(figure: Any, data: Data) -> None:
     legend(figure, axis, 2)
 
 
-def _draw_errors(figure: Any, data: Data, fusion: str) -> None:
-    lanes, scales = _Lanes(data), data["scales"]
-    axes = figure.subplots(3, len(scales), sharex=True, sharey="row", squeeze=False)
-    time = _TIME[::_DRAWN]
-    for column, scale in enumerate(scales):
-        truth, mean, actual, bound = (
-            lanes(fusion, name, f"scale {scale}")[::_DRAWN]
-            for name in ("truth", "mean", "actual_deviation", "conservative_deviation")
-        )
-        for state in range(3):
-            axis = axes[state, column]
-            for sign in (3.0, -3.0):
-                (robust,) = axis.plot(time, sign * bound[:, state], color=palette.BLACK, lw=0.9)
-                (own,) = axis.plot(time, sign * actual[:, state], color=palette.GREEN, lw=0.9)
-            error = (truth - mean)[:, state]
-            (curve,) = axis.plot(time, error, color=_COLOURS[fusion], lw=1.1)
-        axes[0, column].set_title(f"({chr(ord('a') + column)}) {scale:g} of bounds", loc="left")
-        axes[2, column].set_xlabel("step k")
-    for state, row in enumerate(axes):
-        row[0].set_ylabel(f"{STATES[state]}\nerror ({UNITS[state]})")
-        limit = max(
-            lanes(fusion, "conservative_deviation", f"scale {scale}")[60:, state].max()
-            for scale in scales
-        )
-        row[0].set_ylim(-3.0 * limit * 1.05, 3.0 * limit * 1.05)
-    names = ("error of the fused estimate", "robust ±3σ", "actual ±3σ")
-    figure.legend((curve, robust, own), names, loc="outside upper center", ncols=3)
-
-
-def _ellipse(covariance: Array) -> Array:
-    around = np.linspace(0.0, 2.0 * np.pi, 181)
-    root = np.linalg.cholesky(covariance[:2, :2])
-    return np.asarray(root @ np.stack((np.cos(around), np.sin(around))))
-
-
-def _draw_ellipses(figure: Any, data: Data) -> None:
-    axes = figure.subplots(2, 2)
-    for row, fusion in zip(axes, FUSIONS, strict=True):
-        both = _Lanes(data)(fusion, "ellipses", f"scale {data['scales'][0]}")
-        colours = (_COLOURS[fusion], *palette.SENSORS)
-        names = (NAMES[fusion], *SENSORS)
-        for axis in row:
-            for place in (3, 2, 1, 0):
-                for kind, style in ((0, "-"), (1, ":")):
-                    axis.plot(
-                        *_ellipse(both[kind, place]), style, color=colours[place], lw=1.8,
-                        label=names[place] if kind == 0 else None,
-                    )  # fmt: skip
-            axis.set_xlabel("position error (m)")
-        row[0].set_ylabel("velocity error (m/s)")
-        row[0].set_title(f"({'ab'[FUSIONS.index(fusion)]}) {NAMES[fusion]}", loc="left")
-        row[1].set_title("enlarged", loc="left")
-        near = np.abs(_ellipse(both[0, 1])).max(1)
-        row[1].set_xlim(-1.3 * near[0], 1.3 * near[0])
-        row[1].set_ylim(-1.3 * near[1], 1.3 * near[1])
-    entries = [axis.get_legend_handles_labels() for axis in axes[:, 0]]
-    handles, labels = (
-        [each[part][-1] for each in entries] + entries[0][part][-2::-1] for part in (0, 1)
-    )
-    for label, style in (("conservative", "-"), ("actual", ":")):
-        handles.append(axes[0, 0].plot([], [], style, color=palette.INK, lw=1.8)[0])
-        labels.append(label)
-    figure.legend(handles, labels, loc="outside upper center", ncols=7, columnspacing=0.8)
+def _rates_by_reading(every: Mapping[str, Mapping[str, PieceData]]) -> dict[str, str]:
+    heads = "rates of sensors 1 to 3, %", "largest distance from a printed rate, percentage points"
+    rows = [
+        (name, cite(runs["rates"].percent.ours), f"{runs['rates'].far:.1f}")
+        for name, runs in every.items()
+    ]
+    return {"rates_by_reading": table(("reading", *heads), rows)}
 
 
 PAPER = Paper(
@@ -378,17 +287,14 @@ PAPER = Paper(
         Piece("fusion", simulate_fusion, _summarise_fusion, 100.0, 200),
     ),
     {
-        "figure_3": PaperFigure("rates", _draw_thresholds, (7.2, 5.6)),
-        "figure_4": PaperFigure("fusion", _draw_tracking, (7.2, 6.4)),
         "figure_5": PaperFigure("fusion", _draw_traces, (7.2, 6.0)),
         "figure_6": PaperFigure("fusion", _draw_comparison, (7.2, 3.6)),
-        "figure_7": PaperFigure("fusion", partial(_draw_errors, fusion="sci"), (7.2, 5.6)),
-        "figure_8": PaperFigure("fusion", partial(_draw_errors, fusion="sici"), (7.2, 5.6)),
-        "figure_9": PaperFigure("fusion", _draw_ellipses, (7.6, 6.6)),
     },
     {
         "scales": (0.8, 0.6, 0.4), "policy": TRIGGER, "process_ratio": 1.0, "own_ratio": 1.0,
         "start_ratio": None, "power": 1.0, "same_step": False,
     },
     READINGS,
+    claims,
+    _rates_by_reading,
 )  # fmt: skip

@@ -24,7 +24,6 @@ from fusion_gym.systems.correlated.system import CorrelatedTrackingPlant, Correl
 
 STEPS = 600
 SENSORS = ("sensor 1", "sensor 2", "sensor 3")
-ELLIPSES = 100  # the step of Figure 9
 _EVERY = 5  # steps from one comparison of the nodes' matrices to the next
 _START = np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
 _ROUNDING = 1e-8  # of a generalised eigenvalue: without noise below the bounds it is 1
@@ -158,9 +157,6 @@ class ErrorRecord:
     Of the nodes: ``node_bounded`` (L, sensors, E), ``node_gap`` (L, sensors) the largest difference
     of P and P̄ over P's largest entry, ``node_mse`` (L, sensors, E).
 
-    Of the first episode, (L, H, n): ``truth``, ``mean``, ``actual_deviation``,
-    ``conservative_deviation``; of its step ``ELLIPSES``, estimate 0 fused, then the nodes:
-    ``ellipses`` (L, 2, sensors + 1, n, n), conservative and actual.
     """
 
     def __init__(self, count: int, episodes: int, with_nodes: bool) -> None:
@@ -169,7 +165,6 @@ class ErrorRecord:
         self.most: dict[str, Array] = {}
         self.compared = 0
         self.rows: defaultdict[str, list[Array]] = defaultdict(list)
-        self.stored: dict[str, Array] = {}
 
     def arrays(self) -> dict[str, Array]:
         """Return all arrays by name."""
@@ -179,7 +174,7 @@ class ErrorRecord:
             for name, value in self.sums.items()
         }
         series = {name: np.stack(rows, axis=1) for name, rows in self.rows.items()}
-        return means | self.most | series | self.stored
+        return means | self.most | series
 
     def add(self, step: Step) -> None:
         """Add a step."""
@@ -201,20 +196,10 @@ class ErrorRecord:
         self._most(worst=largest)
         for name, value in zip(("mse", "actual", "conservative"), (mse, *traces), strict=True):
             self.rows[f"{name}_steps"].append(self._lanes(value).mean(-1))
-        first = {
-            "truth": truth, "mean": estimate.means[0], "actual_deviation": deviation,
-            "conservative_deviation": bound,
-        }  # fmt: skip
-        for name, value in first.items():
-            self.rows[name].append(self._lanes(value)[..., 0])
         if self.with_nodes:
             self._add(node_mse=((truth - estimate.means[1:]) ** 2).sum(1))
         if step.number % _EVERY == 0:
             self._compare(step)
-        if step.number + 1 == ELLIPSES:
-            own = np.arange(len(SENSORS) + 1)
-            both = np.stack((estimate.covariances, joint[own, own]))
-            self.stored["ellipses"] = self._lanes(both)[..., 0]
 
     def _compare(self, step: Step) -> None:
         estimate = step.state.estimate

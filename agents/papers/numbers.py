@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
 from fusion_gym.evaluation.metrics import LEVEL, Interval, mean_interval
 
-Verdict = Literal[
-    "holds",
-    "fails under the readings tried",
-    "depends on what the text leaves open",
-    "misprint, or lost in our copy of the text",
-    "undecided",
-]
-HOLDS, FAILS, DEPENDS, MISPRINT, UNDECIDED = get_args(Verdict)
 _ENOUGH = 185  # episodes without an exception: with 97.5 %, at most 2 % of all have one
 LOOKS, LARGER = 2, 5  # sizes of a sample, and the second over the first
 
@@ -77,25 +69,6 @@ def grid(columns: Iterable[str], rows: Mapping[str, Iterable[Any]], unit: str = 
         for row, samples in rows.items()
         for column, sample in zip(names, samples, strict=True)
     ]
-
-
-def outcome(parts: Any) -> float:
-    """Return 1 if all conditions of a claim hold, 0 if one of them fails, and else NaN.
-
-    Args:
-        parts: A condition, an array of conditions, or a list of both: 1, 0 or NaN for undecided.
-    """
-    entries = parts if isinstance(parts, list | tuple) else [parts]
-    result = np.concatenate([np.ravel(np.asarray(entry, dtype=float)) for entry in entries])
-    return 0.0 if (result == 0.0).any() else float(result.min())
-
-
-def verdict(outcomes: Iterable[float]) -> Verdict:
-    """Return the verdict on a claim from its outcomes under the readings of the text."""
-    different = set(np.nan_to_num(list(outcomes), nan=0.5).tolist())
-    if {0.0, 1.0} <= different:
-        return DEPENDS
-    return {1.0: HOLDS, 0.0: FAILS}[different.pop()] if different in ({0.0}, {1.0}) else UNDECIDED
 
 
 def estimate(sample: Any) -> Interval:

@@ -1,6 +1,7 @@
 """The pages of a reproduction: Markdown and JSON of a paper, its pictures, and the overview."""
 
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +9,18 @@ import jinja2
 import matplotlib.pyplot as plt
 from PIL import Image
 
-from agents.papers import numbers
-from agents.papers.paper import NAMES, Data, Paper, PaperFigure
+from agents.papers import numbers, old_page
+from agents.papers.claims import Judgement
+from agents.papers.numbers import Number
+from agents.papers.paper import NAMES, Data, Paper, PaperFigure, PieceData
+from fusion_gym.docstrings import table
 from fusion_gym.entries import Plain
 from fusion_gym.output import palette
 from fusion_gym.output.files import read_json, replacing, write, write_text
 
 _COLOURS = 64  # of a PNG, a third of the bytes of all
 OVERVIEW = "README.md"
+_MADE = "({episodes:,} episodes, the first with seed {seed}.)"
 TEMPLATES = Path(__file__).parent
 Counts = Mapping[str, Mapping[str, int]]  # episodes and seed of each piece
 Results = Mapping[str, Mapping[str, Data]]  # of the pieces, by reading
@@ -23,61 +28,85 @@ Results = Mapping[str, Mapping[str, Data]]  # of the pieces, by reading
 
 def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Plain]:
     """Return a paper's Markdown from the data of all its pieces, and its numbers as plain JSON."""
-    outcomes: dict[str, dict[str, float]] = {}  # by claim and reading
-    claims: list[dict[str, str]] = []
-    reading, every = "", dict[str, dict[str, Data]]()
-
-    def claim(text: str, source: str, parts: Any, caller: Callable[[], str]) -> str:
-        text, source = _line(text), _line(source)
-        result, own = parts, outcomes.setdefault(f"{source}: {text}", {})
-        if not isinstance(parts, str):
-            cases = parts if isinstance(parts, Mapping) else {"": parts}
-            for case, conditions in cases.items():
-                key = f"{reading}: {case}" if case else reading
-                own[key] = numbers.outcome(conditions)
-            result = numbers.verdict(own.values())
-        names = [name.rpartition(": ")[2] for name, value in own.items() if value == 1.0]
-        ways = ", ".join(dict.fromkeys(names))
-        region = f": holds with {ways}" if result == numbers.DEPENDS else ""
-        row = {"text": text, "source": source, "verdict": result, "evidence": _line(caller())}
-        claims.append(row)
-        cells = row | {"verdict": f"**{result}**{region}"}
-        return f"| {' | '.join(map(_cell, cells.values()))} |\n"
-
-    def tally() -> list[tuple[str, int]]:
-        """Return the number of claims that hold under each reading."""
-        judged = [own for own in outcomes.values() if set(own) == set(results)]
-        return [(name, sum(own[name] == 1.0 for own in judged)) for name in results]
-
-    template = _template(f"{paper.name}.md")
-    for reading in [*results][::-1]:  # the environment's is the last, and the page's
-        claims.clear()
-        every[reading] = pieces = {
-            piece.name: results[reading][piece.name] | piece.summarise(results[reading][piece.name])
+    if paper.claims is None:
+        return old_page.render_old_page(paper, results, counts)
+    runs = {
+        reading: {
+            piece.name: PieceData(
+                data[piece.name] | piece.summarise(data[piece.name]),
+                episodes=counts[piece.name]["episodes"],
+            )
             for piece in paper.pieces
         }
-        text = template.render(
-            pieces, paper=paper.name, claim=claim, counts=counts, tally=tally, every=every,
-            misprint=numbers.MISPRINT,
-        )  # fmt: skip
+        for reading, data in results.items()
+    }
+    own = next(iter(runs.values()))
+    judgements = [claim.judge(runs) for claim in paper.claims]
+    text = _template(f"{paper.name}.md").render(
+        own | dict(paper.texts(runs)),
+        claims=_claims_table(judgements),
+        readings=_readings_table(judgements, [*runs]),
+        made={name: _MADE.format(**count) for name, count in counts.items()},
+    )
     lines = text.splitlines()
-    tables = [
-        {
-            "piece": name,
-            "name": table,
-            "numbers": [n._asdict() | {"verdict": n.verdict} for n in entries],
-        }
-        for name, piece in pieces.items()
-        for table, entries in piece.get("tables", {}).items()
-    ]
     return text, {
         "paper": paper.name,
         "title": lines[0].removeprefix("# "),
         "citation": lines[2],
         "made": {name: dict(count) for name, count in counts.items()},
-        "tables": tables,
-        "claims": claims,
+        "tables": [
+            {
+                "piece": piece.name,
+                "name": name,
+                "numbers": [n._asdict() | {"verdict": n.verdict} for n in entries],
+            }
+            for piece in paper.pieces
+            for name, entries in own[piece.name].get("tables", {}).items()
+        ],
+        "claims": [
+            {
+                "text": claim.text,
+                "source": claim.source,
+                "verdict": verdict,
+                "evidence": evidence,
+            }
+            for claim, verdict, evidence, _ in judgements
+        ],
     }
+
+
+def _claims_table(judgements: Iterable[Judgement]) -> str:
+    return table(
+        ("claim", "where", "verdict", "evidence"),
+        [
+            (own.claim.text, own.claim.source, f"**{own.verdict}**{own.region}", own.evidence)
+            for own in judgements
+        ],
+    )
+
+
+def _readings_table(judgements: Iterable[Judgement], readings: Sequence[str]) -> str:
+    """Return how many claims hold together under each reading."""
+    every = [own.outcomes for own in judgements if set(own.outcomes) == set(readings)]
+    held = {name: sum(outcomes[name] == 1.0 for outcomes in every) for name in readings}
+    rows = [(name, f"{count}") for name, count in held.items()]
+    rows[0] = f"{readings[0]} (the environment)", rows[0][1]
+    return table(("reading", "claims that hold"), rows)
+
+
+def _number_table(numbers: Iterable[Number]) -> str:
+    rows = [(n.what, n.printed_text, n.text, n.verdict) for n in numbers]
+    return table(("", "printed", "ours (95 %)", "verdict"), rows)
+
+
+def _grid_table(numbers: Iterable[Number]) -> str:
+    """Return the table of numbers named "row: column"."""
+    rows = defaultdict[str, dict[str, str]](dict)
+    for number in numbers:
+        row, _, column = number.what.rpartition(": ")
+        rows[row][column] = number.text
+    columns = tuple(next(iter(rows.values())))
+    return table(("", *columns), [(row, *cells.values()) for row, cells in rows.items()])
 
 
 def write_page(paper: Paper, results: Results, counts: Counts, output: Path) -> Plain:
@@ -110,16 +139,11 @@ def _template(name: str) -> jinja2.Template:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "cell": _cell, "cite": numbers.cite, "line": _line, "number": numbers.number_text,
+        "cell": _cell, "cite": numbers.cite, "number": numbers.number_text,
         "percent": numbers.percent,
     }  # fmt: skip
-    functions = numbers.always, numbers.below, numbers.by_mean, numbers.estimate
-    environment.globals |= {function.__name__: function for function in functions}
+    environment.globals |= {"table": _number_table, "grid": _grid_table}
     return environment.get_template(name)
-
-
-def _line(text: str) -> str:
-    return " ".join(text.split())
 
 
 def _cell(text: str) -> str:

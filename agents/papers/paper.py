@@ -6,6 +6,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from agents.cache import Cache
+from agents.papers.claims import Claims
 from fusion_gym.entries import Plain
 from fusion_gym.validation import ConfigurationError, choice
 
@@ -35,6 +36,15 @@ class Piece(NamedTuple):
     summarise: Callable[[Data], Data]
     weight: float
     usual: int = 1000
+
+
+class PieceData(dict[str, Any]):
+    """Data by name, also as attributes."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self:
+            raise AttributeError(name)
+        return PieceData(self[name]) if isinstance(self[name], dict) else self[name]
 
 
 class PieceJob(NamedTuple):
@@ -80,7 +90,8 @@ class Paper(NamedTuple):
     """A paper: its pieces in the order of its page, its figures by name, and its parameters.
 
     ``readings`` assign what the text leaves open to parameters and to options of the environment,
-    the environment's first.
+    the environment's first. ``texts`` returns more tables of the page, by name, from the data of
+    the pieces by reading.
     """
 
     name: str
@@ -88,6 +99,8 @@ class Paper(NamedTuple):
     figures: Mapping[str, PaperFigure]
     parameters: Settings = NOTHING
     readings: Mapping[str, Settings] = MappingProxyType({"": NOTHING})
+    claims: Claims | None = None
+    texts: Callable[[Mapping[str, Mapping[str, PieceData]]], Mapping[str, str]] = lambda runs: {}
 
     def settings(self, changes: Settings) -> Data:
         """Return the changed parameters, and changed options as ``options``."""

@@ -18,7 +18,8 @@ import tyro
 
 from agents.cache import Cache
 from agents.papers import page
-from agents.papers.numbers import LARGER, UNDECIDED
+from agents.papers.claims import UNDECIDED
+from agents.papers.numbers import LARGER
 from agents.papers.paper import (
     NAMES,
     Data,

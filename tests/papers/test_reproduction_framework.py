@@ -15,7 +15,8 @@ from hostile_folder import contents
 from paths import ROOT
 
 from agents.papers import page, paper
-from agents.papers.numbers import FAILS, HOLDS, Number
+from agents.papers.claims import FAILS, HOLDS, Claim, Claims
+from agents.papers.numbers import Number, below
 from fusion_gym.validation import ConfigurationError
 
 USUAL = 30
@@ -23,16 +24,21 @@ PIECES = ("first", "second")
 Calls = list[tuple[str, int, int]]
 
 
-TEMPLATE = """{% from "parts.md" import figure, made, table with context %}
-# The paper {{ paper }}
+TEMPLATE = """# The paper NAME
 
-A. Author, “{{ paper }}”, 2020.
-{% for piece in (first, second) %}
-{% call claim(paper ~ " claims | " ~ piece.name, "Section 1", "holds") %}So.{% endcall %}
-{{ table(piece.tables[piece.name], "Table") }}
-{{ made(piece.name) }}
-{% endfor %}
-{% call figure("figure_5", "Figure 5") %}What to see.{% endcall %}
+A. Author, “NAME”, 2020.
+
+{% include "claims.md" %}
+
+{{ table(first.tables.first) }}
+
+{{ made.first }}
+
+{{ table(second.tables.second) }}
+
+{{ made.second }}
+
+![Figure 5](NAME/figure_5.png)
 """
 
 
@@ -58,9 +64,13 @@ def a_paper(name: str, calls: Calls) -> paper.Paper:
     def draw(figure: Any, data: paper.Data) -> None:
         figure.subplots().plot(data["sample"])
 
+    def test(first: Any) -> Any:
+        return True, f"So says {first.name}."
+
     return paper.Paper(
         name, [a_piece(piece) for piece in PIECES],
         {"figure_5": paper.PaperFigure("first", draw, (2.0, 1.5))},
+        claims=Claims(Claim(f"{name} claims | {piece}", "Section 1", test) for piece in PIECES),
     )  # fmt: skip
 
 
@@ -73,7 +83,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
     for path in page.TEMPLATES.glob("*.md"):
         (texts / path.name).write_text(path.read_text())
     for name in ("one", "two"):
-        (texts / f"{name}.md").write_text(TEMPLATE)
+        (texts / f"{name}.md").write_text(TEMPLATE.replace("NAME", name))
         module = types.ModuleType(f"agents.papers.{name}")
         module.PAPER = a_paper(name, result)  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, module.__name__, module)
@@ -196,10 +206,12 @@ def test_numbers_of_a_sample_have_its_moments() -> None:
 @pytest.fixture
 def undecided(calls: Calls) -> Calls:
     """The paper ``one`` has a claim that a hundred episodes decide."""
-    text = page.TEMPLATES / "one.md"
-    case = "first.count > 100 or below([-1, 1], 0)"
-    claim = '{% call claim("It is decided.", "Section 2", ' + case + ") %}So.{% endcall %}\n"
-    text.write_text(TEMPLATE.replace("{{ table(", claim + "{{ table("))
+
+    @sys.modules["agents.papers.one"].PAPER.claims.add("Section 2")
+    def test(first: Any) -> Any:
+        """It is decided."""
+        return first.count > 100 or below([-1, 1], 0), "So."
+
     return calls
 
 
@@ -209,7 +221,7 @@ def test_an_undecided_claim_gets_five_times_the_episodes(undecided: Calls) -> No
     first = [(f"{name}/{piece}", USUAL) for name in ("one", "two") for piece in PIECES]
     assert counts == [*first, *((f"one/{piece}", 5 * USUAL) for piece in PIECES)]
     numbers = json.loads(Path("pages/one.json").read_text())
-    assert [claim["verdict"] for claim in numbers["claims"]] == [HOLDS] * 4
+    assert [claim["verdict"] for claim in numbers["claims"]] == [HOLDS] * 3
     assert numbers["made"]["first"]["episodes"] == 5 * USUAL
 
 

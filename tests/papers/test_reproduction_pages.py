@@ -7,12 +7,13 @@ of the committed sample, from its 95 % interval: the fresh one is too small to t
 
 import json
 import math
+import re
 from typing import Any
 
 import pytest
 from paths import ROOT
 
-from agents.papers.numbers import UNDECIDED
+from agents.papers.claims import UNDECIDED
 from agents.papers.page import draw_figure, render_page
 from agents.papers.paper import NAMES, Data, Paper, load_paper
 from fusion_gym.output import palette
@@ -54,7 +55,7 @@ def check_numbers(page: dict[str, Any], fresh: dict[str, Any], episodes: int) ->
 
 def check_claims(page: dict[str, Any], fresh: dict[str, Any], name: str) -> None:
     """The same claims; the page's verdicts are the JSON's, and a fresh run's unless undecided."""
-    text = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+    text = re.sub(" +", " ", (PAGES / f"{name}.md").read_text(encoding="utf-8"))
     differing = []
     for old, new in zip(page["claims"], fresh["claims"], strict=True):
         assert new["text"] == old["text"]

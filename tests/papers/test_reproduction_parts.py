@@ -14,20 +14,15 @@ from agents.papers import adaptive_innovation, markov_jump, unknown_input
 from agents.papers import round_robin_tobit_runs as biased
 from agents.papers import tobit_token_bucket_runs as runs
 from agents.papers.adaptive_innovation_runs import Lane, TriggerReading, _largest, _whitened, steps
+from agents.papers.claims import DEPENDS, FAILS, HOLDS, UNDECIDED, outcome, verdict
 from agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
 from agents.papers.markov_jump_covariances import covariances, iterated_gap
 from agents.papers.numbers import (
-    DEPENDS,
-    FAILS,
-    HOLDS,
-    UNDECIDED,
     above_zero,
     always,
     below,
     cite,
-    outcome,
     percent,
-    verdict,
 )
 from agents.papers.paper import NAMES
 from agents.papers.round_robin_tobit_theorems import MatrixBound, matrix_below

@@ -1,10 +1,13 @@
 """Count code lines: without blanks, comments and docstrings (``make lines``).
 
+The lines of a Jinja template are those with tags.
+
 The string below an option of an environment is the option's docstring (PEP 257)."""
 
 import ast
 import io
 import itertools
+import re
 import subprocess
 import tokenize
 from collections import Counter
@@ -46,6 +49,8 @@ def main() -> None:
     for name in tracked.stdout.split():
         if Path(name).exists():
             counts[Path(name).parts[0]] += code_lines(Path(name).read_text(encoding="utf-8"))
+    for path in Path("agents").rglob("*.md"):
+        counts["agents"] += len(re.findall(r"^.*\{[{%#].*$", path.read_text("utf-8"), re.MULTILINE))
     for folder, count in sorted(counts.items()):
         print(f"{folder:<14}{count:>7,}")
     code = sum(counts[folder] for folder in counts.keys() - NOT_COUNTED - {"tests"})
