@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from agents.papers.drawing import legend, stack
+from agents.papers.markov_jump_claims import SETTLED, claims
 from agents.papers.markov_jump_covariances import covariances, fused_traces, iterated_gap
 from agents.papers.numbers import Number, below, grid
 from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
@@ -28,14 +29,12 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import LagRecursion
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")
 _PAPERS_RUNS = 100
-_LONG, _SHOWN, _INSTANTS = 200, 100, 60  # steps
+_LONG, _SHOWN = 200, 100  # steps
 _LAST = 60  # steps that stand for the settled ones
-_SETTLED = 1e-9  # relative change over a period below which a trace repeats itself
 _MARGIN = 1e-5  # of a threshold beyond the range of those that make a difference
 _PRINTED = {  # of Section 6, with half of their last digit
     "mean of β": ((0.65, 0.39, 0.45), 0.005), "variance of β": ((0.09, 0.0499, 0.0585), 0.00005),
 }  # fmt: skip
-_CLEAR = 4.0  # standard errors: not reached by chance in some dozens of comparisons
 _PERIOD = 6  # steps, after which all sensors' sampling repeats
 _SEARCHED = 4  # packets in a period, up to which all schedules are compared
 
@@ -162,20 +161,19 @@ def period_of(values: Array) -> int:
     """Return the period of values (H,) at their end, or 0."""
     last = values[-_LAST:]
     for period in range(1, _LAST // 3):
-        if np.abs(last[period:] - last[:-period]).max() <= _SETTLED * np.abs(last).max():
+        if np.abs(last[period:] - last[:-period]).max() <= SETTLED * np.abs(last).max():
             return period
     return 0
 
 
 def _summarise_schedule(data: Data) -> Data:
     sent, trace = data["sent"].astype(bool)[:, :_SHOWN], data["trace"]
-    literal, shares = data["literal"].astype(bool), sent.mean(1)
+    shares = sent.mean(1)
     packets, settled = shares.sum(-1), trace[:, -_LAST:].mean(-1)
     columns = ("node 1", "node 2", "node 3", "packets a step", "mean trace", "settled trace")
     values = np.column_stack((shares, packets, trace[:, :_SHOWN].mean(-1), settled))
     fused, own = ([period_of(item) for item in curves] for curves in (trace, data["local"]))
     return {
-        "columns": columns,
         "tables": {
             "schedule": grid(columns, dict(zip(data["labels"], values[..., None], strict=True))),
             "fading": [
@@ -184,9 +182,7 @@ def _summarise_schedule(data: Data) -> Data:
                 for node, (value, ours) in enumerate(zip(printed, data[what].tolist(), strict=True))
             ],
         },
-        "shown": _SHOWN, "instants": _INSTANTS, "settled_from": _LONG - _LAST + 1,
-        "tolerance": _SETTLED, "shares": shares, "packets": packets, "literal": literal,
-        "quiet": int((~literal.all(-1)).nonzero()[0].max(initial=-1)) + 1,
+        "shares": shares, "packets": packets,
         "larger": (trace[1:] >= trace[:-1] * (1.0 - 1e-12)).mean(-1), "settled": settled,
         "fused_periods": np.array(fused), "own_periods": np.array(own),
     }  # fmt: skip
@@ -196,30 +192,29 @@ def _summarise_schedule(data: Data) -> Data:
 
 
 def simulate_tracking(episodes: int, seed: int, settings: Settings) -> Data:
-    """Return estimates of one episode and root mean square errors at every threshold."""
+    """Return root mean square errors at every threshold."""
     task, lanes = read_example(settings), _lanes(settings)
     runs = (run_markov_jump(task, policy, episodes, seed) for policy in lanes.values())
     rows = []
     for run in runs:
         squared = run.squared
         few, every = (np.sqrt(part.mean(-1)) for part in (squared[..., :_PAPERS_RUNS], squared))
-        rows.append((run.mean[..., 0], few, every, squared.mean(0)))
-    names = ("means", "few", "every", "squares")
+        rows.append((few, every, squared.mean(0)))
+    names = ("few", "every", "squares")
     silent = run_markov_jump(task, "never", episodes, seed)
     return {
-        "m": list(settings["m"]), "labels": list(lanes), "truth": silent.truth[..., 0],
-        "silent": silent.squared.mean(0),
+        "m": list(settings["m"]), "labels": list(lanes), "silent": silent.squared.mean(0),
         **{name: np.array(row) for name, row in zip(names, zip(*rows, strict=True), strict=True)},
     }  # fmt: skip
 
 
 def _summarise_tracking(data: Data) -> Data:
     columns = [f"mean squared error of the {state}" for state in STATES]
-    squares, every, few = data["squares"], data["every"], data["few"]
-    rows = dict(zip(data["labels"], squares, strict=True)) | {"nothing sent": data["silent"]}
+    every, few = data["every"], data["few"]
+    rows = dict(zip(data["labels"], data["squares"], strict=True))
+    rows["nothing sent"] = data["silent"]
     return {
-        "columns": columns, "tables": {"errors": grid(columns, rows)}, "papers_runs": _PAPERS_RUNS,
-        "states": STATES, "raised": below(squares[:-1], squares[1:]),
+        "tables": {"errors": grid(columns, rows)},
         "top": (every[-1] >= every.max(0)).mean(0), "few_top": (few[-1] >= few.max(0)).mean(0),
     }  # fmt: skip
 
@@ -269,32 +264,21 @@ def _exact(estimator: Any, horizon: int) -> Array:
     return np.ascontiguousarray(joint.transpose(4, 0, 2, 1, 3)).reshape(horizon + 1, size, size)
 
 
-def _agrees(sample: Array, claim: float) -> bool:
-    error = sample.std(ddof=1) / np.sqrt(len(sample))
-    return bool(abs(sample.mean() - claim) <= _CLEAR * error)
-
-
 def _summarise_theorems(data: Data) -> Data:
-    local = list(zip(data["local"], data["claimed"].tolist(), strict=True))
-    fused = list(zip(data["fused"], data["traces"], strict=True))
-    moment = (data["moment"], data["moment_claimed"])
-    ratios = {f"node {i + 1}": pair for i, pair in enumerate(local)}
-    ratios |= {f"fused, m = {m:g}": pair for m, pair in zip(data["m"], fused, strict=True)}
-    ratios |= {"the state": moment}
-    rows = {name: [sample / claim] for name, (sample, claim) in ratios.items()}
+    local = data["local"] / data["claimed"][:, None]
+    ratios = {f"node {i + 1}": own for i, own in enumerate(local)}
+    fused = data["fused"] / np.array(data["traces"])[:, None]
+    ratios |= {f"fused, m = {m:g}": own for m, own in zip(data["m"], fused, strict=True)}
+    ratios |= {"the state": data["moment"] / data["moment_claimed"]}
     pairs = zip(data["m"], data["traces"], data["printed"], strict=True)
     algorithm = {f"m = {m:g}": ([exact], [printed]) for m, exact, printed in pairs}
     columns = "exact joint covariance", "Algorithm 1 as printed"
     return {
         "tables": {
-            "covariances": grid(("ratio",), rows), "algorithm_1": grid(columns, algorithm),
-        },
-        "algorithm": columns,
-        "least": np.array(data["least"]), "local_pairs": local, "fused_pairs": fused,
-        "moment_right": _agrees(*moment),
-        "local_right": [_agrees(*item) for item in local],
-        "fused_right": [_agrees(*item) for item in fused],
-    }  # fmt: skip
+            "covariances": grid(("ratio",), {name: [own] for name, own in ratios.items()}),
+            "algorithm_1": grid(columns, algorithm),
+        }
+    }
 
 
 # --- what as many packets could bring -------------------------------------------------------------
@@ -343,67 +327,26 @@ def _summarise_others(data: Data) -> Data:
     }
     rows = zip(m, zip(paper, data["chance"], strict=True), strict=True)
     return {
-        "columns": columns,
         "tables": {
             "rates": grid(columns, {f"m = {level:g}": pair for level, pair in rows}),
             "beside": grid(("squared error",), references),
         },
-        "shares": np.mean(data["rates"], axis=1), "period": _PERIOD, "schedules": schedules,
+        "shares": np.mean(data["rates"], axis=1), "schedules": schedules,
         "far": below(1.1 * data["best"], paper[searched]),
     }  # fmt: skip
 
 
 # --- figures --------------------------------------------------------------------------------------
 
-# A colour and a line for each threshold or policy, the same in all figures.
+# A colour and a line for each threshold, the same in both figures.
 _LINES: tuple[tuple[str, Any], ...] = (
     (palette.GREEN, "-"),
     (palette.BLUE, (0, (5, 1))),
     (palette.ORANGE, "-"),
     (palette.VERMILLION, (0, (1.5, 0.8))),
-    (palette.PURPLE, "-"),
-    (palette.SKY, (0, (5, 1))),
-    (palette.BLACK, (0, (1.5, 0.8))),
 )
 _TIME = "time k (steps of 0.5 s)"
-_LANE = 1.7
 _legend = partial(legend, columns=99, handlelength=1.8, columnspacing=1.2, handletextpad=0.5)
-
-
-def _draw_instants(figure: Any, data: Data) -> None:
-    """Draw a panel per threshold, without m = 0 unless it is the only one."""
-    lanes = list(zip(data["labels"], data["sent"].astype(bool)[:, :_INSTANTS], strict=True))
-    lanes = [lane for lane in lanes if lane[0] != "m = 0"] or lanes
-    axes = stack(figure, len(lanes), _TIME)
-    for place, (axis, (label, sent)) in enumerate(zip(axes, lanes, strict=True)):
-        time, count = np.arange(1, len(sent) + 1), sent.shape[-1]
-        for sensor in range(count):
-            base, colour = _LANE * (count - 1 - sensor), palette.SENSORS[sensor]
-            there = sent[:, sensor]
-            axis.plot(time[there], base + there[there], "o", ms=4, color=colour)
-            axis.plot(
-                time[~there], 0.0 * time[~there] + base, "o", ms=2.6, mfc="none", color=colour
-            )
-            axis.text(
-                1.01, (base + 1.0) / (_LANE * count + 0.3), f"node {sensor + 1}",
-                transform=axis.transAxes, va="center", color=colour,
-            )  # fmt: skip
-        ticks = [_LANE * lane + up for lane in range(count) for up in (0, 1)]
-        axis.set_yticks(ticks, ["0", "1"] * count)
-        axis.set_ylim(-0.5, _LANE * count - 0.2)
-        axis.set_title(f"({chr(ord('a') + place)}) {label}", loc="left")
-    axes[len(lanes) // 2].set_ylabel("received (1) or not (0)")
-
-
-def _draw_tracking(figure: Any, data: Data) -> None:
-    axes = stack(figure, len(STATES), _TIME)
-    truth = data["truth"]
-    time = np.arange(1, len(truth) + 1)
-    for state, axis in enumerate(axes):
-        axis.plot(time, truth[:, state], color=palette.TRUTH, lw=1.8, label="state")
-        _curves(axis, data, data["means"][..., state])
-        _title(axis, state, STATES[state])
-    _legend(figure, axes)
 
 
 def _draw_errors(figure: Any, data: Data) -> None:
@@ -431,10 +374,9 @@ def _title(axis: Any, state: int, what: str) -> None:
 
 
 def _curves(axis: Any, data: Data, values: Array, width: float = 1.4, alpha: float = 1.0) -> None:
-    """Draw a curve (H,) of each threshold or policy, labelled if it is opaque."""
+    """Draw a curve (H,) of each threshold, labelled if it is opaque."""
     time = np.arange(1, values.shape[1] + 1)
-    for place, (label, curve) in enumerate(zip(data["labels"], values, strict=True)):
-        colour, line = _LINES[place % len(_LINES)]
+    for label, curve, (colour, line) in zip(data["labels"], values, _LINES, strict=True):
         shown = {"ls": line, "label": label} if alpha == 1.0 else {}
         axis.plot(time, curve, color=colour, lw=width, alpha=alpha, **shown)
 
@@ -448,11 +390,10 @@ PAPER = Paper(
         Piece("others", simulate_others, _summarise_others, 30.0),
     ),
     {
-        "figure_2": PaperFigure("schedule", _draw_instants, (7.2, 6.4)),
-        "figure_3": PaperFigure("tracking", _draw_tracking, (7.2, 5.0)),
         "figure_4": PaperFigure("tracking", _draw_errors, (7.2, 5.0)),
         "figure_5": PaperFigure("schedule", _draw_traces, (7.2, 3.9)),
     },
     {"m": (0.0, 0.9, 1.3, 1.5), "augmented": False, "reference": None},
     READINGS,
+    claims,
 )  # fmt: skip

@@ -4,6 +4,8 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from agents.papers.claims import FAILS, HOLDS, Claims
 from agents.papers.paper import PieceData
 
@@ -11,6 +13,12 @@ Runs = Mapping[str, Any]  # data by piece
 Change = Mapping[str, Any]  # values by path, such as rates.percent.ours
 Pair = tuple[Change, Change]
 ENOUGH = 200  # episodes
+
+
+def about(*means: float) -> np.ndarray[Any, Any]:
+    """Return samples (means, runs) that vary by a hundredth, each its own way."""
+    noise = np.random.default_rng(0).uniform(-0.01, 0.01, (len(means), ENOUGH))
+    return np.array(means)[:, None] * (1.0 + noise)
 
 
 def verdicts(claims: Claims, runs: Runs) -> dict[str, str]:

@@ -1,31 +1,23 @@
 """The claims on the adaptive innovation trigger, on synthetic runs."""
 
-from typing import Any
-
 import numpy as np
-from synthetic_claims import changed, check, verdicts
+from synthetic_claims import ENOUGH, about, changed, check, verdicts
 
 from agents.papers.adaptive_innovation_claims import claims
 from agents.papers.claims import FAILS, MISPRINT
 
-RUNS, STEPS = 200, 40
-
-
-def about(*means: float) -> np.ndarray[Any, Any]:
-    """Return samples (means, runs) that vary by a hundredth, each its own way."""
-    noise = np.random.default_rng(0).uniform(-0.01, 0.01, (len(means), RUNS))
-    return np.array(means)[:, None] * (1.0 + noise)
+STEPS = 40
 
 
 PERCENT = {
-    "ours": about(60, 48, 70), "printed_sign": about(3, 3, 3), "timed": np.full((3, RUNS), 100.0),
+    "ours": about(60, 48, 70), "printed_sign": about(3, 3, 3), "timed": np.full((3, ENOUGH), 100.0),
     "fixed": about(40, 30, 47),
 }  # fmt: skip
 AT = {
     "mse": about(0.4, 0.3), "conservative": about(0.9, 0.5),
-    "square": np.full((2, 3, RUNS), 0.001), "level": np.full((2, 3, RUNS), 1.0),
+    "square": np.full((2, 3, ENOUGH), 0.001), "level": np.full((2, 3, ENOUGH), 1.0),
     "mse_steps": np.full((2, STEPS), 0.4), "conservative_steps": np.full((2, STEPS), 0.9),
-    "beats": np.ones((2, 3, RUNS)),
+    "beats": np.ones((2, 3, ENOUGH)),
 }  # fmt: skip
 SYNTHETIC = {
     "rates": {
@@ -54,7 +46,7 @@ CHANGES = {
     "With a = 0 the mechanism is the time trigger, with c = 0 one with a fixed threshold.": {
         "rates.unmoved": 0.1
     },
-    "Both fused estimates track well.": {"fusion.at.square": np.full((2, 3, RUNS), 0.02)},
+    "Both fused estimates track well.": {"fusion.at.square": np.full((2, 3, ENOUGH), 0.02)},
     "The MSE is close to the trace of the actual error variance.": {
         "fusion.relative": about(1, 20)
     },
