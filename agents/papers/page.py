@@ -45,7 +45,7 @@ def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Pl
     text = _template(f"{paper.name}.md").render(
         own | dict(paper.texts(runs)),
         claims=_claims_table(judgements),
-        readings=_readings_table(judgements, [*runs]),
+        claims_by_reading=_readings_table(judgements, [*runs]),
         made={name: _MADE.format(**count) for name, count in counts.items()},
     )
     lines = text.splitlines()
