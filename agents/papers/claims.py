@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import string
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+
+from agents.papers.numbers import cite, number_text, percent
 
 Verdict = Literal[
     "holds",
@@ -18,44 +21,61 @@ Verdict = Literal[
 HOLDS, FAILS, DEPENDS, MISPRINT, UNDECIDED = get_args(Verdict)
 
 
-Test = Callable[..., tuple[Any, str]]
+Test = Callable[..., Any]
 
 
 class Claim(NamedTuple):
-    """A claim of a paper: its sentence, where it stands, and its test.
+    """A claim of a paper: its sentence, where it stands, its evidence and its test.
 
-    ``test`` takes the data of the pieces that its arguments name, under one reading, and returns
-    conditions and evidence. The conditions are a condition, an array of conditions, or a list of
-    both: 1, 0 or NaN for undecided; a mapping of these by what the sentence leaves open; or
-    ``MISPRINT``. The evidence is a text with the numbers.
+    ``test`` takes the data of the pieces that its arguments name, under one reading. It returns the
+    conditions: a condition, an array of conditions, or a list of both, each 1, 0 or NaN for
+    undecided; a mapping of these by what the sentence leaves open; or ``MISPRINT``. It may return a
+    mapping of numbers with them. ``evidence`` is a text with fields for ``str.format``, which name
+    these numbers or the data of the pieces.
     """
 
     text: str
     source: str
+    evidence: str
     test: Test
 
     def judge(self, runs: Mapping[str, Mapping[str, Any]]) -> Judgement:
         """Return the verdict from the data of all pieces by reading, the environment's first."""
-        outcomes = dict[str, float]()
+        outcomes, conditions, values = dict[str, float](), None, dict[str, Any]()
         for reading, data in [*runs.items()][::-1]:
-            names = inspect.signature(self.test).parameters
-            conditions, evidence = self.test(*(data[name] for name in names))
+            values = {name: data[name] for name in inspect.signature(self.test).parameters}
+            conditions = self.test(**values)
+            if isinstance(conditions, tuple):
+                conditions, numbers = conditions
+                values |= numbers
             cases = conditions if isinstance(conditions, Mapping) else {"": conditions}
             for case, parts in cases.items():
                 if not isinstance(parts, str):
                     outcomes[f"{reading}: {case}" if case else reading] = outcome(parts)
         own = MISPRINT if isinstance(conditions, str) else verdict(outcomes.values())
-        return Judgement(self, own, evidence, outcomes)
+        return Judgement(self, own, _Evidence().vformat(self.evidence, (), values), outcomes)
+
+
+class _Evidence(string.Formatter):
+    """Fields of samples as means with intervals; with ``%`` shares in per cent."""
+
+    def format_field(self, value: Any, spec: str) -> str:
+        if spec == "%":
+            return percent(value)
+        if spec:
+            return number_text(value, spec)
+        return cite(value) if isinstance(value, list | tuple | np.ndarray) else str(value)
 
 
 class Claims(list[Claim]):
     """The claims of a paper in the order of its page."""
 
     def add(self, source: str) -> Callable[[Test], Test]:
-        """Return a decorator that adds a test, whose docstring is the sentence."""
+        """Return a decorator that adds a test, whose docstring is sentence and evidence."""
 
         def decorate(test: Test) -> Test:
-            self.append(Claim(" ".join((test.__doc__ or "").split()), source, test))
+            text, _, evidence = inspect.cleandoc(test.__doc__ or "").partition("\n\n")
+            self.append(Claim(" ".join(text.split()), source, " ".join(evidence.split()), test))
             return test
 
         return decorate

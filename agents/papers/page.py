@@ -3,23 +3,19 @@
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import matplotlib.pyplot as plt
-from PIL import Image
 
 from agents.papers import numbers, old_page
 from agents.papers.claims import Judgement
 from agents.papers.numbers import Number
-from agents.papers.paper import NAMES, Data, Paper, PaperFigure, PieceData
+from agents.papers.paper import NAMES, Data, Paper, PieceData
 from fusion_gym.docstrings import table
 from fusion_gym.entries import Plain
 from fusion_gym.output import palette
 from fusion_gym.output.files import read_json, replacing, write, write_text
 
-_COLOURS = 64  # of a PNG, a third of the bytes of all
-OVERVIEW = "README.md"
 _MADE = "({episodes:,} episodes, the first with seed {seed}.)"
 TEMPLATES = Path(__file__).parent
 Counts = Mapping[str, Mapping[str, int]]  # episodes and seed of each piece
@@ -110,11 +106,13 @@ def _grid_table(numbers: Iterable[Number]) -> str:
 
 
 def write_page(paper: Paper, results: Results, counts: Counts, output: Path) -> Plain:
-    """Write a paper's pictures, its page and its numbers, and return the numbers."""
+    """Write a paper's figures, its page and its numbers, and return the numbers."""
     text, content = render_page(paper, results, counts)
     for name, figure in paper.figures.items():
-        data = results[next(iter(paper.readings))][figure.piece]
-        write_figure(figure, data, output / paper.name / name)
+        path = output / paper.name / f"{name}.png"
+        with plt.rc_context(palette.READABLE), replacing(path) as partial:
+            drawing = figure.draw_data(results[next(iter(paper.readings))][figure.piece])
+            drawing.savefig(partial, format="png", metadata={"Software": None})
     write_text(output / f"{paper.name}.md", text)
     write(output / f"{paper.name}.json", content)
     return content
@@ -124,58 +122,29 @@ def write_overview(output: Path) -> None:
     """Write the page over all papers with stored numbers."""
     paths = [output / f"{name}.json" for name in NAMES]
     papers = [read_json(path, "numbers") for path in paths if path.exists()]
-    for paper in papers:
-        verdicts = [n["verdict"] for table in paper["tables"] for n in table["numbers"]]
-        paper |= {word: verdicts.count(word) for word in ("agrees", "differs")}
-    write_text(output / OVERVIEW, _template("overview.md").render(papers=papers))
+    sections = "\n\n".join(map(_section, papers))
+    write_text(output / "README.md", _template("overview.md").render(papers=sections))
+
+
+def _section(paper: Plain) -> str:
+    """Return the overview's section on a paper."""
+    verdicts = [n["verdict"] for table in paper["tables"] for n in table["numbers"]]
+    agrees, differs = verdicts.count("agrees"), verdicts.count("differs")
+    count = f"{agrees} of {agrees + differs} printed numbers agree with ours.\n\n"
+    rows = [(claim["text"], claim["source"], claim["verdict"]) for claim in paper["claims"]]
+    return (
+        f"## [{paper['title']}]({paper['paper']}.md)\n\n{paper['citation']}\n\n"
+        f"{count if agrees + differs else ''}{table(('claim', 'where', 'verdict'), rows)}"
+    )
 
 
 def _template(name: str) -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {
-        "cell": _cell, "cite": numbers.cite, "number": numbers.number_text,
-        "percent": numbers.percent,
-    }  # fmt: skip
+    filters = {"cite": numbers.cite, "number": numbers.number_text, "percent": numbers.percent}
+    environment.filters |= filters
     environment.globals |= {"table": _number_table, "grid": _grid_table}
     return environment.get_template(name)
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
-
-
-def draw_figure(figure: PaperFigure, data: Data) -> Any:
-    """Return a matplotlib Figure, which the caller closes, in the style of the pages."""
-    with plt.rc_context(palette.READABLE):
-        result = plt.figure(figsize=figure.size, layout="constrained")
-        try:
-            figure.draw(result, data)
-        except BaseException:
-            plt.close(result)
-            raise
-        return result
-
-
-def write_figure(figure: PaperFigure, data: Data, path: Path) -> None:
-    """Write a figure as PNG and SVG; the path has no suffix."""
-    drawing = draw_figure(figure, data)
-    with plt.rc_context(palette.READABLE):
-        try:
-            for suffix in ("png", "svg"):
-                with replacing(path.with_name(f"{path.name}.{suffix}")) as partial:
-                    drawing.savefig(partial, format=suffix, metadata=_UNDATED[suffix])
-                    if suffix == "png":
-                        with Image.open(partial) as picture:
-                            reduced = picture.convert("RGB").quantize(_COLOURS)
-                        reduced.save(partial, "PNG", optimize=True)
-        finally:
-            plt.close(drawing)
-
-
-_UNDATED: dict[str, Plain] = {"png": {"Software": None}, "svg": {"Date": None}}

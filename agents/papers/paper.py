@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from matplotlib.figure import Figure
+
 from agents.cache import Cache
 from agents.papers.claims import Claims
 from fusion_gym.entries import Plain
@@ -84,6 +86,12 @@ class PaperFigure(NamedTuple):
     piece: str
     draw: Callable[[Any, Data], None]
     size: tuple[float, float] = (7.2, 4.2)
+
+    def draw_data(self, data: Data) -> Figure:
+        """Return the drawn figure."""
+        result = Figure(figsize=self.size, layout="constrained")
+        self.draw(result, data)
+        return result
 
 
 class Paper(NamedTuple):

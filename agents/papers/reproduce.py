@@ -3,7 +3,7 @@
     python -m agents.papers tobit_token_bucket
     python -m agents.papers all --resume
 
-Into the output folder go a page a paper (``PAPER.md``), its figures (PNG and SVG), its numbers
+Into the output folder go a page a paper (``PAPER.md``), its figures, its numbers
 (``PAPER.json``), and ``README.md`` with every claim's verdict. Simulations are kept in the work
 folder as they are finished; ``--resume`` skips those, if they were made from the same inputs by the
 same code.
@@ -20,13 +20,7 @@ from agents.cache import Cache
 from agents.papers import page
 from agents.papers.claims import UNDECIDED
 from agents.papers.numbers import LARGER
-from agents.papers.paper import (
-    NAMES,
-    Data,
-    Paper,
-    PieceJob,
-    load_papers,
-)
+from agents.papers.paper import NAMES, Data, Paper, PieceJob, load_papers
 from agents.workers import Call, Pool, run_parallel
 from fusion_gym.commands.command_line import OUTPUT_FOLDER, Long, Seed, whole
 from fusion_gym.output.ending import ended_like_by_ctrl_c
