@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ TRACKING = "fusion_gym/BiasedTracking-v1"
 STATES = 3  # x1, x2, b
 PAPER_RUNS = 1000
 _RESAMPLES = 500
-_CLEAR = 4.0  # standard errors: of 200 comparisons without a difference none is likely to reach it
+CLEAR = 4.0  # standard errors: of 200 comparisons without a difference none is likely to reach it
 FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
 
 
@@ -51,11 +51,6 @@ def node_squares(task: Task, policy: Policy | str, episodes: int, seed: int) -> 
         error = truth - task.estimator.local_means(batch.delivered.estimate)
         local[runs, step] = (error**2).transpose(2, 0, 1)
     return fused, local
-
-
-def held_values(task: Task, policy: str, seed: int) -> Array:
-    """Return the estimators' values (H, sensors) in the first run, by equation (4)."""
-    return record(task, policy, 1, seed, lambda state: state.estimate.held[:, 0, 0])
 
 
 def resampled(episodes: int) -> Array:
@@ -138,27 +133,19 @@ def floor(env: str, **options: Any) -> list[float]:
     return np.sqrt(np.diagonal(covariances[..., 0], axis1=1, axis2=2)).mean(0).tolist()
 
 
-class Comparison(NamedTuple):
-    """At how many points one curve is clearly lower, clearly higher, or lower by the mean."""
-
-    outcome: float
-    lower: int
-    higher: int
-    by_mean: int
-    points: int
-
-
-def always_below(difference: Array) -> Comparison:
+def always_below(difference: Array) -> tuple[float, str]:
     """Return whether one curve lies below another at every step, and at how many points.
 
     ``difference`` (2, H, …) is the mean of the paired differences of squared errors with its
     standard error. It holds if all points are clearly lower, and fails if one is clearly higher.
     """
     mean, error = difference
-    lower = (mean < -_CLEAR * error) & (error > 0)
-    higher = (mean > _CLEAR * error) & (error > 0)
-    result = 0.0 if higher.any() else 1.0 if lower.all() else np.nan
-    return Comparison(result, lower.sum(), higher.sum(), (mean < 0).sum(), mean.size)
+    lower = (mean < -CLEAR * error) & (error > 0)
+    higher = (mean > CLEAR * error) & (error > 0)
+    return 0.0 if higher.any() else 1.0 if lower.all() else np.nan, (
+        f"clearly lower at {lower.sum()} of {mean.size} points, clearly higher at {higher.sum()}, "
+        f"lower by the mean at {(mean < 0).sum()}"
+    )
 
 
 @dataclass(frozen=True)

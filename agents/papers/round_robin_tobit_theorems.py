@@ -8,7 +8,7 @@ from scipy import stats
 
 import fusion_gym
 from agents.papers import round_robin_tobit_runs as measures
-from agents.papers.numbers import Number, always, grid
+from agents.papers.numbers import Number, grid
 from agents.papers.paper import Data, Settings
 from agents.papers.round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, censored
 from agents.papers.walk import SomeSensors, record, walk
@@ -35,13 +35,12 @@ EXAMPLES: dict[str, tuple[str, Options]] = {
     "target, uncensored": (TRACKING, {}),
 }
 _ENVIRONMENTS = {"oscillator": OSCILLATOR, "target": TRACKING}
-_CLEAR = 4.0  # standard errors
 # Where the text leaves a choice. Upper bound: the sign of φ (Theorem 4 adds it, (15) with an
 # infinite right threshold subtracts it), and whether the correction holds the filter's covariance,
 # as printed, or the bound itself. Lower bound: whether the factor 1 - (1 - ᾱ - β̄)² stands at every
 # step, as printed, or at the sensor's turns alone, and whether the process covariance stands whole
 # or, as in (49), with the factor (1 - ᾱ - β̄)².
-_BOUNDS: tuple[tuple[str, str, tuple[Any, bool]], ...] = (
+BOUNDS: tuple[tuple[str, str, tuple[Any, bool]], ...] = (
     ("upper", "as printed", (1.0, False)), ("upper", "the sign of φ as in (15)", (-1.0, False)),
     ("upper", "the bound in its own correction", (1.0, True)), ("upper", "both", (-1.0, True)),
     ("lower", "as printed", (False, False)), ("lower", "at the sensor's turns", (True, False)),
@@ -131,7 +130,7 @@ class MatrixBound(NamedTuple):
     """A bound of a sensor's covariance P⁻: P^u or P^l of Theorem 4, in a reading.
 
     ``inflation`` is 1 for a single filter and ε⁻¹ for a node, whose process covariance is Q/ε by
-    (27); ``reading`` is an entry of _BOUNDS for its ``end``.
+    (27); ``reading`` is an entry of BOUNDS for its ``end``.
     """
 
     task: Task
@@ -171,14 +170,14 @@ class MatrixBound(NamedTuple):
 def failures(
     task: Task, policy: Policy | str, episodes: int, seed: int, sensors: list[int]
 ) -> Array:
-    """Return shares (bounds, episodes) of an episode's steps in which each of _BOUNDS fails.
+    """Return shares (bounds, episodes) of an episode's steps in which each of BOUNDS fails.
 
     Of one sensor by Theorem 4; of both nodes by Theorem 5, which joins their bounds. The proof
     starts with P^u = P⁻ and P^l = 0.
     """
     joined, node = len(sensors) > 1, censored(task).centre.sensors
     inflation = 1.0 / SHARE if joined else 1.0
-    bounds = [[MatrixBound(task, m, inflation, row[0], row[2]) for m in sensors] for row in _BOUNDS]
+    bounds = [[MatrixBound(task, m, inflation, row[0], row[2]) for m in sensors] for row in BOUNDS]
     failed = np.zeros((len(bounds), episodes))
     for step, (batch, requests) in enumerate(walk(task, policy, episodes, seed)):
         covariance = batch.state.estimate.prior_covariance
@@ -228,41 +227,14 @@ def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def summarise_theory(data: Data) -> Data:
-    """Return the numbers of Lemma 1, Theorems 1 and 2 and the remarks."""
+    """Return the table of the filter's consistency."""
     numbers = {
         **{f"NEES of the fused estimate, {name}": f"{name}_nees" for name in _ENVIRONMENTS},
         "share of uncensored packets, predicted by (9)": "oscillator_predicted",
         "share of uncensored packets, simulated": "oscillator_uncensored",
     }
-    pairs = {
-        "right": ("mean", "equation_12"), "printed": ("mean", "equation_12_printed"),
-        "values": ("variance", "equation_13"), "total": ("variance", "total_variance"),
-    }  # fmt: skip
-    gaps = {name: np.abs(data[own] - data[other]) for name, (own, other) in pairs.items()}
-    off = {
-        name: int((gaps[name] > _CLEAR * np.maximum(data[f"{own}_error"], 1e-12)).sum())
-        for name, (own, _) in pairs.items()
-    }
-    own, free, calm = (np.array(data[f"armse_{name}"]) for name in ("paper", "free", "calm"))
     theory = [Number.from_sample(what, data[name]) for what, name in numbers.items()]
-    return {
-        "tables": {"theory": theory},
-        "places": PLACES, "off": off, "worst": int(gaps["printed"].argmax()),
-        "most": int(gaps["values"].argmax()),
-        "correlation": {name: _correlation(data, name) for name in _ENVIRONMENTS},
-        "sure_below": SURE, "node_shares": SHARES,
-        "gap": data["oscillator_predicted"] - data["oscillator_uncensored"],
-        "times": data["oscillator_surprised"].sum() / data["oscillator_sure"].sum(),
-        "worse": own / free, "calmer": own / calm,
-    }  # fmt: skip
-
-
-def _correlation(data: Data, name: str) -> Array:
-    """The bias's correlation of successive errors: its interval's ends and median."""
-    weights = measures.resampled(len(data["oscillator_nees"]))
-    parts = (weights @ data[f"{name}_{part}"] for part in ("product", "first", "second"))
-    product, first, second = parts
-    return np.quantile(product / np.sqrt(first * second), [0.025, 0.5, 0.975])
+    return {"tables": {"theory": theory}}
 
 
 def summarise_bounds(data: Data) -> Data:
@@ -270,17 +242,6 @@ def summarise_bounds(data: Data) -> Data:
     rows = {
         f"Theorem {theorem}, {end} bound, {reading}{which}": 100 * data["shares"][:, case, bound]
         for case, (theorem, which) in enumerate(((4, ", sensor 1"), (4, ", sensor 2"), (5, "")))
-        for bound, (end, reading, _) in enumerate(_BOUNDS)
+        for bound, (end, reading, _) in enumerate(BOUNDS)
     }
-    ends, shares, count = {}, data["shares"].mean(-1), data["shares"].shape[-1]
-    for theorem, worst in ((4, shares[:, :2].max(1)), (5, shares[:, 2])):
-        for end in ("upper", "lower"):
-            own = [i for i, row in enumerate(_BOUNDS) if row[0] == end]
-            best = min(own, key=worst.sum(0).__getitem__)
-            ends[f"{end}_{theorem}"] = {
-                "cases": {_BOUNDS[i][1]: always(1.0 - worst[:, i].max(), count) for i in own},
-                "printed": worst[:, own[0]].tolist(), "best": _BOUNDS[best][1],
-                "shares": worst[:, best].tolist(),
-            }  # fmt: skip
-    tables = {"bounds": grid(EXAMPLES, rows, "%")}
-    return {"examples": list(EXAMPLES), "tables": tables, "ends": ends}
+    return {"tables": {"bounds": grid(EXAMPLES, rows, "%")}}

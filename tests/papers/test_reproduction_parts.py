@@ -224,9 +224,9 @@ def test_one_point_above_is_told_from_all_below() -> None:
     error = np.full((100, 2), 1.0)
     one_above = np.where(np.arange(100)[:, None] == 3, 5.0, -5.0) * error
     one_open = np.where(np.arange(100)[:, None] == 3, 0.0, -5.0) * error
-    assert biased.always_below(np.stack([-5.0 * error, error])).outcome == 1.0
-    assert biased.always_below(np.stack([one_above, error])).outcome == 0.0
-    assert math.isnan(biased.always_below(np.stack([one_open, error])).outcome)
+    assert biased.always_below(np.stack([-5.0 * error, error]))[0] == 1.0
+    assert biased.always_below(np.stack([one_above, error]))[0] == 0.0
+    assert math.isnan(biased.always_below(np.stack([one_open, error]))[0])
 
 
 @pytest.mark.parametrize("points", [1, 20])
