@@ -1,9 +1,9 @@
-"""Joint input and state filters under an adaptive threshold: Figures 1 to 7 and the theorems.
+"""Joint input and state filters under an adaptive threshold: Figures 3, 4, 6 and the theorems.
 
 Source: unknown_input, Section 4.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from agents.papers import unknown_input_recursion as recursion
-from agents.papers.drawing import legend, set_ticks
-from agents.papers.numbers import below, estimate, grid
+from agents.papers.drawing import legend
+from agents.papers.numbers import estimate, grid
 from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
+from agents.papers.unknown_input_claims import claims
 from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -26,7 +27,6 @@ from fusion_gym.systems.unknown_input.nodes import TableNodes
 from fusion_gym.systems.unknown_input.system import DrivenPlant, UnknownInputEstimator
 
 PRINTED, CARTS = "paper", "two_carts"
-EXAMPLES = (PRINTED, CARTS)
 NAMES = {PRINTED: "the printed example", CARTS: "two carts"}
 TRIGGER = "adaptive_threshold"
 OURS, FIXED = "paper's filter and trigger", "paper's filter, fixed threshold ρ̄"
@@ -39,7 +39,6 @@ LANES: dict[str, tuple[str, Options]] = {
     WALK: (TRIGGER, {"filter": "random_walk"}),
     "Kalman filter with a random-walk input, always": ("always", {"filter": "random_walk"}),
 }
-KINDS = ("states", "inputs")
 _HOLD = {PRINTED: {"hold_variance": 0.05}}  # as the example's page does
 _SMALL = 0.2  # ρ̄ over the noise's variance, where (1 + 1/ε) ρ̄ - V is negative
 _CHANGE = 0.2  # deviation of a random-walk input's change over its own
@@ -121,7 +120,7 @@ def leading(errors: Array, bounds: Array) -> Array:
 def simulate_filters(episodes: int, seed: int, settings: Settings) -> Data:
     """Return all data by example, ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane too."""
     data: Data = {"lanes": list(LANES)}
-    for example in EXAMPLES:
+    for example in NAMES:
         result = _example(example, episodes, seed, settings)
         data |= {f"{example}_{name}": value for name, value in result.items()}
     return data
@@ -148,8 +147,6 @@ def _example(example: str, episodes: int, seed: int, settings: Settings) -> Data
         rates.append(record.granted.mean(0))
         if name == OURS:
             data |= _under_the_trigger(task, rule, record)
-        if name == WALK:
-            data["walk"] = record.fused[..., 0]
     return data | {"mse": np.array(mse), "rates": np.array(rates)}
 
 
@@ -162,11 +159,10 @@ def _options_of(example: str, settings: Settings) -> Options:
 
 
 def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> Data:
-    """Return the data of the paper's figures, and the ratio of errors to bounds.
+    """Return errors, bounds and thresholds.
 
-    Estimates are the fused one, then the nodes'. ``truth`` (H, s), ``local`` (H, l, s), ``fused``
-    (H, s) and ``granted`` (H, l) are of the first episode; ``square`` and ``bound`` (H, l + 1, s)
-    are mean squared errors and bounds; ``each`` (l + 1, 2, E) squared errors and ``filled``
+    Estimates are the fused one, then the nodes'. ``square`` and ``bound`` (H, l + 1, s) are mean
+    squared errors and bounds; ``each`` (l + 1, 2, E) squared errors and ``filled``
     (l + 1, 2, E) their ratio to the bounds, of states and inputs; ``power`` (2, E) the mean square
     of both, ``steady`` (2, E) the fused squared errors in the two halves of the episodes;
     ``within`` the share of silent steps with |σ|² at most ρ̄; ``rho_range`` the least step of the
@@ -193,8 +189,7 @@ def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> D
     limit = np.broadcast_to(high, rho.shape[1:])
     steady = [(part[:, 0] ** 2).sum(1).mean(0) for part in np.array_split(errors, 2)]
     return {
-        "truth": record.truth[..., 0], "local": record.local[..., 0], "fused": record.fused[..., 0],
-        "granted": record.granted[..., 0].astype(np.int64), "square": (errors**2).mean(-1),
+        "square": (errors**2).mean(-1),
         "bound": np.moveaxis(np.diagonal(bounds, axis1=1, axis2=2), 1, 0),
         "each": halves((errors**2).mean(0), n, 1), "filled": np.array(filled),
         "power": halves((record.truth**2).mean(0), n, 0), "steady": np.array(steady),
@@ -205,32 +200,19 @@ def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> D
 
 
 def _summarise_filters(data: Data) -> Data:
-    """The page's numbers by example, in :data:`EXAMPLES`."""
+    """The page's table, and the data of both examples by name, in :data:`NAMES`."""
     columns = ("rate in %", "MSE of the states", "MSE of the inputs")
     rows = {
-        f"{NAMES[e]}, {lane}": (100.0 * data[f"{e}_rates"][i].mean(0), *data[f"{e}_mse"][i])
-        for e in EXAMPLES
-        for i, lane in enumerate(data["lanes"])
+        f"{name}, {lane}": (100.0 * data[f"{e}_rates"][i].mean(0), *data[f"{e}_mse"][i])
+        for e, name in NAMES.items()
+        for i, lane in enumerate(LANES)
     }
-    examples = [_summarise_example(data, example) for example in EXAMPLES]
-    return {"examples": examples, "columns": columns, "tables": {"settings": grid(columns, rows)}}
-
-
-def _summarise_example(data: Data, example: str) -> Data:
-    start = f"{example}_"
-    part = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
-    ours, fixed, walk = (data["lanes"].index(name) for name in (OURS, FIXED, WALK))
-    power, each, steady = part["power"].mean(-1), part["each"], part["steady"]
-    states = [entry for entry, _ in _STATES[example]]
-    return part | {
-        "name": NAMES[example], "power": power, "relative": part["mse"][ours] / power[:, None],
-        "walk": part["mse"][walk] / power[:, None],
-        "filled": np.max(estimate(part["filled"]).high, axis=-1),
-        "growth": steady[1] / steady[0].mean(),
-        "best": [nodes[nodes.mean(-1).argmin()] for nodes in each[1:].swapaxes(0, 1)],
-        "better": below(each[0], each[1:]), "rates": part["rates"][ours],
-        "fixed": part["rates"][fixed], "root": np.sqrt(each[0].mean(-1) / power),
-        "slack": (part["bound"][:, 0] / part["square"][:, 0]).mean(0)[states],
+    names = [name.removeprefix(f"{PRINTED}_") for name in data if name.startswith(PRINTED)]
+    both = {name: [data[f"{example}_{name}"] for example in NAMES] for name in names}
+    return both | {
+        "tables": {"settings": grid(columns, rows)}, "names": list(NAMES.values()),
+        "filled": [np.max(estimate(own).high, -1) for own in both["filled"]],
+        "slack": [(data[f"{e}_bound"] / data[f"{e}_square"])[:, 0].mean(0) for e in NAMES],
     }  # fmt: skip
 
 
@@ -262,7 +244,7 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
     data["power"] = halves((record.truth**2).mean(0), 2, 0)
     runs = [
         _recursion(example, TRIGGER, episodes, seed, **_options_of(example, settings))
-        for example in EXAMPLES
+        for example in NAMES
     ]
     excess = [np.mean([each["excess"].mean(0) for each in every], axis=0) for _, every in runs]
     record, every = runs[0]
@@ -301,149 +283,47 @@ def _recursion(
 
 
 def _summarise_printed(data: Data) -> Data:
-    node, readings = data["node"], data["readings"]
-    exact, inverted, partly, small = (
-        readings.index(name)
-        for name in (
-            recursion.EXACT, recursion.INVERTED, recursion.PARTLY, recursion.DEVIATIONS,
-        )
-    )  # fmt: skip
-    power = data["power"].mean(-1)
-    share = node.mean(-1) / power[:, None].T
-    least = share[:, :, 1].min(1)
-    columns = [f"node {i + 1}, {kind}" for kind in KINDS for i in range(node.shape[1])]
-    samples = node.swapaxes(1, 2).reshape(len(readings), len(columns), -1)
+    node, power = data["node"], data["power"].mean(-1)
+    columns = [f"node {i + 1}, {kind}" for kind in ("states", "inputs") for i in range(2)]
+    samples = node.swapaxes(1, 2).reshape(len(node), len(columns), -1)
     return {
-        "tables": {"readings": grid(columns, dict(zip(readings, samples, strict=True)))},
-        "columns": columns, "power": power, "state": node[exact, :, 0],
-        "trace": data["trace"][exact], "residual": max(data["hidden"][exact]),
-        "floor": np.sqrt(np.array(data["floor"])),
-        "share": share[..., 0], "inverted": inverted, "partly": partly, "small_noise": small,
-        "best": least.min(), "where": readings[least.argmin()], "input_columns": data["columns"],
+        "tables": {"readings": grid(columns, dict(zip(data["readings"], samples, strict=True)))},
+        "power": power, "floor": np.sqrt(data["floor"]), "share": node.mean(-1) / power,
     }  # fmt: skip
 
 
 # --- figures --------------------------------------------------------------------------------------
 
-Entries = Mapping[str, Sequence[tuple[int, str]]]
-# Entries of [x; d] that stand for the paper's: what each is called, and its unit.
-_STATES: Entries = {
-    PRINTED: ((0, "$x^1$"), (1, "$x^2$")),
-    CARTS: ((0, "cart 1 (m)"), (2, "cart 2 (m)")),
+# Entries of [x; d] that stand for the paper's, and the label of their sum.
+_FIGURES = {
+    "figure_3": {
+        PRINTED: ([0], "$x^1$: squared error"),
+        CARTS: ([0], "cart 1: squared error (m²)"),
+    },
+    "figure_4": {
+        PRINTED: ([1], "$x^2$: squared error"),
+        CARTS: ([2], "cart 2: squared error (m²)"),
+    },
+    "figure_6": {PRINTED: ([2, 3], "trace"), CARTS: ([4], "trace (N²)")},
 }
-_INPUTS: Entries = {PRINTED: ((2, "$d^1$"), (3, "$d^2$")), CARTS: ((4, "force (N)"),)}
-_WALK = "Kalman filter, random-walk input"
 
 
-def _time(data: Data) -> NDArray[np.int64]:
-    return np.arange(1, len(data[f"{PRINTED}_truth"]) + 1)
-
-
-def _curves(axis: Any, data: Data, example: str, entry: int) -> None:
-    """Draw truth, nodes, fused estimate and the Kalman filter, scaled to fused and true values."""
-    time = _time(data)
-    truth, fused = (data[f"{example}_{name}"][:, entry] for name in ("truth", "fused"))
-    local = data[f"{example}_local"][:, :, entry]
-    axis.plot(time, truth, color=palette.TRUTH, lw=3.2, label="true value")
-    for node in range(local.shape[1]):
-        colour, label = palette.SENSORS[node], f"node {node + 1}"
-        axis.plot(time, local[:, node], color=colour, lw=0.9, label=label)
-    axis.plot(time, fused, color=palette.FUSED, lw=1.8, label="fused")
-    walk = data[f"{example}_walk"][:, entry]
-    axis.plot(time, walk, color=palette.GREEN, lw=1.3, label=_WALK)
-    every = np.concatenate((truth, fused, walk))
-    room = 0.15 * np.ptp(every)
-    axis.set_ylim(every.min() - room, every.max() + room)
-
-
-def _grid(figure: Any, data: Data, rows: int) -> Any:
-    axes = figure.subplots(rows, 2, sharex=True, squeeze=False)
-    for column, example in enumerate(EXAMPLES):
-        axes[0, column].set_title(NAMES[example].removeprefix("the "), loc="left")
-        axes[-1, column].set_xlabel("sampling instant k")
-        axes[-1, column].set_xlim(0, len(_time(data)))
-    return axes
-
-
-def _rank(label: str) -> int:
-    """Order the truth, the fused estimate, the nodes, the rest."""
-    return {"true value": 0, "fused": 1}.get(label, 2 if label.startswith("node") else 3)
-
-
-_legend = partial(legend, rank=_rank, fontsize=9, columnspacing=1.0)
-
-
-def _draw_estimates(figure: Any, data: Data, entries: Entries) -> None:
-    axes = _grid(figure, data, 2)
-    for column, example in enumerate(EXAMPLES):
-        for row, (entry, label) in enumerate(entries[example]):
-            _curves(axes[row, column], data, example, entry)
-            axes[row, column].set_ylabel(label)
-    if len(entries[CARTS]) == 1:
-        axes[1, 1].remove()
-        axes[0, 1].tick_params(labelbottom=True)
-        axes[0, 1].set_xlabel("sampling instant k")
-        axes = [*axes[:, 0].tolist(), axes[0, 1]]
-    _legend(figure, axes, 6)
-
-
-def _labels(data: Data, example: str) -> list[tuple[str, str]]:
-    nodes = data[f"{example}_square"].shape[1] - 1
-    own = [(f"node {i + 1}", palette.SENSORS[i]) for i in range(nodes)]
-    return [("fused", palette.FUSED), *own]
-
-
-def _draw_bounds(figure: Any, data: Data, entries: Entries, label: str, unit: str) -> None:
+def _draw_bounds(figure: Any, data: Data, entries: Mapping[str, tuple[list[int], str]]) -> None:
     """Draw bounds solid, mean squared errors dotted, summed over the entries."""
-    axes = _grid(figure, data, 1)
-    for column, example in enumerate(EXAMPLES):
-        axis, places = axes[0, column], [entry for entry, _ in entries[example]]
+    axes = figure.subplots(1, 2)
+    for axis, (example, (places, label)) in zip(axes, entries.items(), strict=True):
         bound, square = (data[f"{example}_{n}"][..., places].sum(-1) for n in ("bound", "square"))
-        for place, (name, colour) in enumerate(_labels(data, example)):
-            width = 2.2 if place == 0 else 1.3
-            axis.plot(_time(data), bound[:, place], color=colour, lw=width, label=name)
-            axis.plot(_time(data), square[:, place], ":", color=colour, lw=width)
-        axis.set_yscale("log")
-        text = label.format(entries[example][0][1].replace(" (m)", ""))
-        axis.set_ylabel(text + (unit if example == CARTS else ""))
-    axis.plot([], [], "-", color=palette.INK, label="upper bound")
-    axis.plot([], [], ":", color=palette.INK, label="MSE")
-    _legend(figure, axes, 7)
-
-
-def _draw_input_bounds(figure: Any, data: Data) -> None:
-    axes = _grid(figure, data, 1)
-    for column, example in enumerate(EXAMPLES):
-        axis, bound = axes[0, column], data[f"{example}_bound"]
-        for (entry, name), style in zip(_INPUTS[example], ("-", "--"), strict=False):
-            for place, (label, colour) in enumerate(_labels(data, example)):
-                axis.plot(
-                    _time(data), bound[:, place, entry], style, color=colour,
-                    lw=2.2 if place == 0 else 1.3, label=label if style == "-" else None,
-                )  # fmt: skip
-            if example == PRINTED:
-                axis.plot([], [], style, color=palette.INK, label=name)
-        axis.set_yscale("log")
-        axis.set_ylabel("bound" + (" (N²)" if example == CARTS else ""))
-    set_ticks(axes[0, 1], [5.0, 7.0, 10.0, 14.0])
-    _legend(figure, axes, 7)
-
-
-def _draw_instants(figure: Any, data: Data) -> None:
-    axes = _grid(figure, data, 1)
-    for column, example in enumerate(EXAMPLES):
-        axis, granted = axes[0, column], data[f"{example}_granted"].astype(bool)
-        nodes = granted.shape[1]
-        for node in range(nodes):
-            when = _time(data)[granted[:, node]]
-            axis.plot(when, np.full(len(when), node), "|", color=palette.SENSORS[node], ms=16)
-        axis.set_yticks(range(nodes), [f"sensor {node + 1}" for node in range(nodes)])
-        axis.set_ylim(-0.6, nodes - 0.4)
-        axis.grid(False, axis="y")
-
-
-def _figure(draw: Any, height: float) -> PaperFigure:
-    return PaperFigure("filters", draw, (7.6, height))
+        time = np.arange(1, len(bound) + 1)
+        for place in range(bound.shape[1]):
+            colour, width = (palette.SENSORS[place - 1], 1.3) if place else (palette.FUSED, 2.2)
+            name = f"node {place}" if place else "fused"
+            axis.plot(time, bound[:, place], color=colour, lw=width, label=name)
+            axis.plot(time, square[:, place], ":", color=colour, lw=width)
+        axis.set(yscale="log", ylabel=label, xlabel="sampling instant k", xlim=(0, len(time)))
+        axis.set_title(NAMES[example].removeprefix("the "), loc="left")
+    axes[-1].plot([], [], "-", color=palette.INK, label="upper bound")
+    axes[-1].plot([], [], ":", color=palette.INK, label="MSE")
+    legend(figure, axes, 7, fontsize=9, columnspacing=1.0)
 
 
 PAPER = Paper(
@@ -453,23 +333,10 @@ PAPER = Paper(
         Piece("printed", simulate_printed, _summarise_printed, 60.0, 500),
     ),
     {
-        "figure_1": _figure(partial(_draw_estimates, entries=_STATES), 5.0),
-        "figure_2": _figure(partial(_draw_estimates, entries=_INPUTS), 5.0),
-        **{
-            f"figure_{3 + place}": _figure(
-                partial(
-                    _draw_bounds, label="{}: squared error", unit=" (m²)",
-                    entries={name: states[place : place + 1] for name, states in _STATES.items()},
-                ),
-                3.6,
-            )
-            for place in range(2)
-        },
-        "figure_5": _figure(_draw_input_bounds, 3.6), "figure_6": _figure(
-            partial(_draw_bounds, entries=_INPUTS, label="trace", unit=" (N²)"), 3.6
-        ),
-        "figure_7": _figure(_draw_instants, 2.6),
+        name: PaperFigure("filters", partial(_draw_bounds, entries=entries), (7.6, 3.6))
+        for name, entries in _FIGURES.items()
     },
     {"policy": TRIGGER},
     READINGS,
-)  # fmt: skip
+    claims,
+)

@@ -12,15 +12,13 @@ from fusion_gym.systems.unknown_input.system import DrivenPlant
 
 # I - C ℬ L in (20) is a projection, its singular values are 0 or at least 1: what lies between is
 # rounding, and half a 1 tells one from the other.
-EXACT_CUTOFF, _SOME, _MACHINE = 0.5, 1e-8, 0.0
-EXACT, INVERTED = "(20), rounding set to zero", "(20), rounding inverted by the pseudo-inverse"
-PARTLY, DEVIATIONS = "(20), rounding above 1e-8 inverted", "0.001 as standard deviations"
+EXACT_CUTOFF = 0.5
 UNKNOWN_INPUT_READINGS: dict[str, Options] = {
-    EXACT: {},
-    INVERTED: {"cutoff": _MACHINE},
-    PARTLY: {"cutoff": _SOME},
+    "(20), rounding set to zero": {},
+    "(20), rounding inverted by the pseudo-inverse": {"cutoff": 0.0},
+    "(20), rounding above 1e-8 inverted": {"cutoff": 1e-8},
     "every step sampled, a = 1": {"options": {"sampling_period": 1}},
-    DEVIATIONS: {
+    "0.001 as standard deviations": {
         "options": {
             "process_covariance": ((1e-6, 0.0), (0.0, 1e-6)), "measurement_covariance": 1e-6,
         }
