@@ -1,6 +1,6 @@
 """Common parts of figures: panels, legends over all axes, and fixed ticks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,22 +15,14 @@ def stack(figure: Any, count: int, label: str, **style: Any) -> Any:
     return axes
 
 
-def legend(
-    figure: Any,
-    axes: Any,
-    columns: int,
-    place: str = "upper",
-    rank: Callable[[str], int] = lambda label: 0,
-    **style: Any,
-) -> None:
-    """Draw one legend above or below all axes, with each label once, ordered by its rank."""
+def legend(figure: Any, axes: Any, columns: int, place: str = "upper", **style: Any) -> None:
+    """Draw one legend above or below all axes, with each label once."""
     entries: Plain = {}
     for axis in np.ravel(axes):
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    labels = sorted(entries, key=rank)
-    handles, ncols = [entries[label] for label in labels], min(columns, len(labels))
-    figure.legend(handles, labels, loc=f"outside {place} center", ncols=ncols, **style)
+    keys = {"loc": f"outside {place} center", "ncols": min(columns, len(entries))}
+    figure.legend(entries.values(), entries, **keys, **style)
 
 
 def set_ticks(axis: Any, values: Sequence[float]) -> None:

@@ -3,7 +3,6 @@
 Source: unknown_input, Section 4.
 """
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -39,9 +38,7 @@ LANES: dict[str, tuple[str, Options]] = {
     WALK: (TRIGGER, {"filter": "random_walk"}),
     "Kalman filter with a random-walk input, always": ("always", {"filter": "random_walk"}),
 }
-_HOLD = {PRINTED: {"hold_variance": 0.05}}  # as the example's page does
-_SMALL = 0.2  # ρ̄ over the noise's variance, where (1 + 1/ε) ρ̄ - V is negative
-_CHANGE = 0.2  # deviation of a random-walk input's change over its own
+_SMALL = 0.0002  # ρ̄ for which (1 + 1/ε) ρ̄ - V is negative
 _STEPS: Options = {"input_signal": "steps", "input_amplitude": 150.0}
 # The input that the text leaves open, of the printed example.
 READINGS: dict[str, Options] = {
@@ -119,26 +116,24 @@ def leading(errors: Array, bounds: Array) -> Array:
 
 def simulate_filters(episodes: int, seed: int, settings: Settings) -> Data:
     """Return all data by example, ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane too."""
-    data: Data = {"lanes": list(LANES)}
-    for example in NAMES:
-        result = _example(example, episodes, seed, settings)
-        data |= {f"{example}_{name}": value for name, value in result.items()}
-    return data
+    return {
+        f"{example}_{name}": value
+        for example in NAMES
+        for name, value in _example(example, episodes, seed, settings).items()
+    }
 
 
 def _example(example: str, episodes: int, seed: int, settings: Settings) -> Data:
     data: Data = {}
     mse, rates = [], []
     for name, (policy, options) in LANES.items():
-        policy = settings["policy"] if policy == TRIGGER else policy
-        own = _options_of(example, settings)
-        options = options | own | {"example": example}
-        if name == WALK:
-            options |= _HOLD.get(example, {})
-            if size := float(own.get("input_amplitude", 0.0)):
-                options["input_change"], options["input_deviation"] = _CHANGE * size, size
+        options = options | _options_of(example, settings) | {"example": example}
+        if name == WALK and example == PRINTED:
+            options["hold_variance"] = 0.05  # as the example's page does
+            if size := options.get("input_amplitude"):
+                options["input_change"], options["input_deviation"] = 0.2 * size, size
         task, plant = make_example(**options)
-        rule = fusion_gym.make_policy(settings["policy"], task)
+        rule = fusion_gym.make_policy(TRIGGER, task)
         assert isinstance(rule, AdaptiveThreshold)
         if name == FIXED:
             task, plant = make_example(**(options | {"rho_initial": rule.rho_bar}))
@@ -152,10 +147,7 @@ def _example(example: str, episodes: int, seed: int, settings: Settings) -> Data
 
 def _options_of(example: str, settings: Settings) -> Options:
     """Return the options of an example; the carts keep their input."""
-    options: Options = settings["options"]
-    if example == PRINTED:
-        return options
-    return {name: value for name, value in options.items() if not name.startswith("input_")}
+    return dict(settings["options"]) if example == PRINTED else {}
 
 
 def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> Data:
@@ -180,13 +172,11 @@ def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> D
         [leading(errors[:, place, block], bounds[place, block, block]) for block in blocks]
         for place in range(len(bounds))
     ]
-    sensors = record.square.shape[1]
-    low, high = (rule.column(name, sensors) for name in ("rho_initial", "rho_bar"))
+    low, high = (rule.column(name, record.square.shape[1]) for name in ("rho_initial", "rho_bar"))
     levels = [np.broadcast_to(low, record.square.shape[1:])]  # ρ, at first of the first judgement
     for row in record.square:
         levels.append(rule.threshold_after(levels[-1], row))
     rho, silent = np.array(levels), ~record.granted
-    limit = np.broadcast_to(high, rho.shape[1:])
     steady = [(part[:, 0] ** 2).sum(1).mean(0) for part in np.array_split(errors, 2)]
     return {
         "square": (errors**2).mean(-1),
@@ -195,7 +185,7 @@ def _under_the_trigger(task: Task, rule: AdaptiveThreshold, record: Record) -> D
         "power": halves((record.truth**2).mean(0), n, 0), "steady": np.array(steady),
         "within": 1.0 - float((record.square > high)[silent].sum()) / max(silent.sum(), 1),
         "rho_range": [np.diff(rho, axis=0).min(), (rho / low).min(), (rho / high).max()],
-        "settled": (rho < 0.99 * limit).sum(0).max(0).astype(float), "radius": nodes.tables.radius,
+        "settled": (rho < 0.99 * high).sum(0).max(0).astype(float), "radius": nodes.tables.radius,
     }  # fmt: skip
 
 
@@ -228,58 +218,44 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
     over its least, ``sent`` and ``silent`` (l, E) traces of Ξ_x on the printed example,
     ``negative``: the share of silent instants with an indefinite Ξ_x.
     """
-    data: Data = {"readings": list(recursion.UNKNOWN_INPUT_READINGS)}
-    node, trace, hidden = [], [], []
+    own, rows = _options_of(PRINTED, settings), []
     for reading in recursion.UNKNOWN_INPUT_READINGS.values():
-        options, policy = reading.get("options", {}), reading.get("policy", TRIGGER)
-        cutoff = reading.get("cutoff", recursion.EXACT_CUTOFF)
-        options = _options_of(PRINTED, settings) | options
-        record, every = _recursion(PRINTED, policy, episodes, seed, cutoff, **options)
-        estimates = [np.moveaxis(each["estimate"], 1, 2) for each in every]
-        errors = record.truth[:, None] - np.stack(estimates, axis=1)
-        node.append(halves((errors**2).mean(0), 2, 1))
-        trace.append([each["trace"].mean(0) for each in every])
-        hidden.append([float(each["hidden"].max()) for each in every])
-    data |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
-    data["power"] = halves((record.truth**2).mean(0), 2, 0)
-    runs = [
-        _recursion(example, TRIGGER, episodes, seed, **_options_of(example, settings))
-        for example in NAMES
-    ]
-    excess = [np.mean([each["excess"].mean(0) for each in every], axis=0) for _, every in runs]
-    record, every = runs[0]
-    traces, granted = np.stack([each["trace"] for each in every], axis=1), record.granted
-    for name, where in (("silent", ~granted), ("sent", granted)):
-        data[name] = (where * traces).sum(0) / np.maximum(where.sum(0), 1)
-    small = _SMALL * 0.001
-    low = _options_of(PRINTED, settings) | {"rho_bar": small, "rho_initial": small}
-    record, every = _recursion(PRINTED, TRIGGER, episodes, seed, **low)
-    least = np.stack([each["least"] for each in every], axis=1)
-    paper = make_example(example=PRINTED, filter="paper")[1]
-    every_step = make_example(example=PRINTED, filter="paper", sampling_period=1)[1]
-    silent = ~record.granted
-    negative = float((least[silent] < 0.0).sum()) / max(int(silent.sum()), 1)
-    data |= {"excess": np.array(excess), "negative": negative, "small": small}
-    return data | recursion.decoupling(paper, every_step)
+        record, result = _recursion(PRINTED, episodes, seed, own, reading)
+        square = (record.truth[:, None] - result["estimate"]) ** 2
+        residual = result["hidden"].max((0, 2))
+        rows.append((halves(square.mean(0), 2, 1), result["trace"].mean(0), residual))
+    node, trace, hidden = map(np.array, zip(*rows, strict=True))
+    data: Data = {"node": node, "trace": trace, "hidden": hidden}
+    record, result = _recursion(PRINTED, episodes, seed, own, {})
+    for name, where in (("silent", ~record.granted), ("sent", record.granted)):
+        data[name] = (where * result["trace"]).sum(0) / np.maximum(where.sum(0), 1)
+    carts = _recursion(CARTS, episodes, seed, {}, {})[1]
+    low = own | {"rho_bar": _SMALL, "rho_initial": _SMALL}
+    low_record, low_result = _recursion(PRINTED, episodes, seed, low, {})
+    silent = ~low_record.granted
+    negative = float((low_result["least"][silent] < 0.0).sum()) / max(int(silent.sum()), 1)
+    plants = (make_example(example=PRINTED, sampling_period=a)[1] for a in (2, 1))
+    return data | recursion.decoupling(*plants) | {
+        "readings": list(recursion.UNKNOWN_INPUT_READINGS), "negative": negative, "small": _SMALL,
+        "power": halves((record.truth**2).mean(0), 2, 0),
+        "excess": np.array([each["excess"].mean(0).mean(0) for each in (result, carts)]),
+    }  # fmt: skip
 
 
 def _recursion(
-    example: str,
-    policy: str,
-    episodes: int,
-    seed: int,
-    cutoff: float = recursion.EXACT_CUTOFF,
-    **options: Any,
-) -> tuple[Record, list[dict[str, Array]]]:
+    example: str, episodes: int, seed: int, options: Options, reading: Options
+) -> tuple[Record, dict[str, Array]]:
     """Return a run, and the printed filter of each node on the trigger's deliveries."""
-    task, plant = make_example(example=example, filter="paper", **options)
-    usual = make_example(example=example, filter="paper")[0]
-    rho_bar = options.get("rho_bar", float(np.max(usual.policy_defaults[TRIGGER]["rho_bar"])))
-    record = record_run(task, policy, episodes, seed)
-    return record, [
+    options = {"example": example, "filter": "paper"} | options | reading.get("options", {})
+    task, plant = make_example(**options)
+    rho_bar = float(np.max(task.policy_defaults[TRIGGER]["rho_bar"]))
+    record = record_run(task, reading.get("policy", TRIGGER), episodes, seed)
+    cutoff = reading.get("cutoff", recursion.EXACT_CUTOFF)
+    results = [
         recursion.run(model, record.held[:, i], record.granted[:, i], cutoff)
         for i, model in enumerate(recursion.models(plant, _FACTOR[example], rho_bar))
     ]
+    return record, {name: np.stack([own[name] for own in results], 1) for name in results[0]}
 
 
 def _summarise_printed(data: Data) -> Data:
@@ -294,21 +270,15 @@ def _summarise_printed(data: Data) -> Data:
 
 # --- figures --------------------------------------------------------------------------------------
 
-# Entries of [x; d] that stand for the paper's, and the label of their sum.
+# Entries of [x; d] that stand for the paper's, and their label.
 _FIGURES = {
-    "figure_3": {
-        PRINTED: ([0], "$x^1$: squared error"),
-        CARTS: ([0], "cart 1: squared error (m²)"),
-    },
-    "figure_4": {
-        PRINTED: ([1], "$x^2$: squared error"),
-        CARTS: ([2], "cart 2: squared error (m²)"),
-    },
-    "figure_6": {PRINTED: ([2, 3], "trace"), CARTS: ([4], "trace (N²)")},
+    "figure_3": {PRINTED: ([0], "$x^1$"), CARTS: ([0], "cart 1 (m²)")},
+    "figure_4": {PRINTED: ([1], "$x^2$"), CARTS: ([2], "cart 2 (m²)")},
+    "figure_6": {PRINTED: ([2, 3], "inputs"), CARTS: ([4], "force (N²)")},
 }
 
 
-def _draw_bounds(figure: Any, data: Data, entries: Mapping[str, tuple[list[int], str]]) -> None:
+def _draw_bounds(figure: Any, data: Data, entries: dict[str, tuple[list[int], str]]) -> None:
     """Draw bounds solid, mean squared errors dotted, summed over the entries."""
     axes = figure.subplots(1, 2)
     for axis, (example, (places, label)) in zip(axes, entries.items(), strict=True):
@@ -319,7 +289,8 @@ def _draw_bounds(figure: Any, data: Data, entries: Mapping[str, tuple[list[int],
             name = f"node {place}" if place else "fused"
             axis.plot(time, bound[:, place], color=colour, lw=width, label=name)
             axis.plot(time, square[:, place], ":", color=colour, lw=width)
-        axis.set(yscale="log", ylabel=label, xlabel="sampling instant k", xlim=(0, len(time)))
+        axis.set(yscale="log", xlabel="sampling instant k", xlim=(0, len(time)))
+        axis.set_ylabel(f"squared error, {label}")
         axis.set_title(NAMES[example].removeprefix("the "), loc="left")
     axes[-1].plot([], [], "-", color=palette.INK, label="upper bound")
     axes[-1].plot([], [], ":", color=palette.INK, label="MSE")
@@ -336,7 +307,6 @@ PAPER = Paper(
         name: PaperFigure("filters", partial(_draw_bounds, entries=entries), (7.6, 3.6))
         for name, entries in _FIGURES.items()
     },
-    {"policy": TRIGGER},
-    READINGS,
-    claims,
+    readings=READINGS,
+    claims=claims,
 )

@@ -66,9 +66,9 @@ def _(filters: Any) -> Any:
 def _(filters: Any) -> Any:
     """The fused estimate is consistent."""
     largest = [own[0] for own in filters.filled]
-    return np.less_equal(
-        largest, 1
-    ), f"The same of the fused estimate, at most {_both(largest, '.2g')}."
+    return np.less_equal(largest, 1), (
+        f"The same of the fused estimate, at most {_both(largest, '.2g')}."
+    )
 
 
 @claims.add("Theorem 3")

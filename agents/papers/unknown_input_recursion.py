@@ -70,10 +70,8 @@ def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) 
     gain = b @ onto_input + k @ hidden
     free = np.linalg.svd(cb)[0][:, cb.shape[1] :]  # a basis of what (14) leaves free
     best = b @ onto_input
-    if free.size:
-        best = best + (phi @ c.T - best @ omega) @ free @ np.linalg.inv(
-            free.T @ omega @ free
-        ) @ np.broadcast_to(free.T, (len(omega), *free.T.shape))
+    inverse = np.linalg.inv(free.T @ omega @ free)
+    best = best + (phi @ c.T - best @ omega) @ free @ inverse @ free.T
 
     def spread(n: Array) -> Array:
         retention = eye_n - n @ c
@@ -95,7 +93,7 @@ def _pseudo_inverse(matrix: Array, cutoff: float) -> Array:
 def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
     """Run a node's filter (8) on held measurements (H, m, E); times first, episodes second.
 
-    ``estimate`` (H, E, s), ``trace`` (H, E) of Ξ_x, ``least`` (H, E) the smallest eigenvalue of
+    ``estimate`` (H, s, E), ``trace`` (H, E) of Ξ_x, ``least`` (H, E) the smallest eigenvalue of
     Ξ_x, ``hidden`` (H, E) the largest entry of ℬ - N C ℬ (14), and ``excess`` (H, E) the ratio of
     the trace of (18) to the trace under the best gain.
     """
@@ -115,7 +113,7 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
         trace, best = (np.trace(result[name], axis1=1, axis2=2) for name in _TRACES)
         estimate = np.concatenate((mean, (result["input"] @ apart)[..., 0]), axis=1)
         hidden = np.abs(b - result["gain"] @ c @ b).max((1, 2))
-        rows.append((estimate, trace, least, hidden, trace / best - 1.0))
+        rows.append((estimate.T, trace, least, hidden, trace / best - 1.0))
     return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
 
 
