@@ -113,7 +113,7 @@ integrations-rllib: .venv-rllib/.installed  ## RLlib
 benchmark: $(STAMP)  ## triggers, rules and learned policies of every class, 150 minutes: results/
 	$(BIN)/python -m agents.benchmark
 
-papers: $(STAMP)  ## the five papers' figures, tables and claims: docs/reproduction/
+papers: $(STAMP)  ## the five papers' tables, curves and claims: docs/reproduction/
 	$(BIN)/python -m agents.papers all --resume
 
 papers-check: $(STAMP)  ## the papers' verdicts from a tenth of the episodes, against the pages'

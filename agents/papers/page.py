@@ -7,7 +7,7 @@ from pathlib import Path
 import jinja2
 import matplotlib.pyplot as plt
 
-from agents.papers import numbers, old_page
+from agents.papers import numbers
 from agents.papers.claims import Judgement
 from agents.papers.numbers import Number
 from agents.papers.paper import NAMES, Data, Paper, PieceData
@@ -24,8 +24,6 @@ Results = Mapping[str, Mapping[str, Data]]  # of the pieces, by reading
 
 def render_page(paper: Paper, results: Results, counts: Counts) -> tuple[str, Plain]:
     """Return a paper's Markdown from the data of all its pieces, and its numbers as plain JSON."""
-    if paper.claims is None:
-        return old_page.render_old_page(paper, results, counts)
     runs = {
         reading: {
             piece.name: PieceData(

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from agents.cache import Cache
-from agents.papers.claims import Claims
+from agents.papers.claims import Claim
 from fusion_gym.entries import Plain
 from fusion_gym.validation import ConfigurationError, choice
 
@@ -107,7 +107,7 @@ class Paper(NamedTuple):
     figures: Mapping[str, PaperFigure]
     parameters: Settings = NOTHING
     readings: Mapping[str, Settings] = MappingProxyType({"": NOTHING})
-    claims: Claims | None = None
+    claims: Sequence[Claim] = ()
     texts: Callable[[Mapping[str, Mapping[str, PieceData]]], Mapping[str, str]] = lambda runs: {}
 
     def settings(self, changes: Settings) -> Data:

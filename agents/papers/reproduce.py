@@ -1,4 +1,4 @@
-"""Reproduce the simulation sections of the five papers: figures, tables and claims.
+"""Reproduce the simulation sections of the five papers: tables, curves and claims.
 
     python -m agents.papers tobit_token_bucket
     python -m agents.papers all --resume
