@@ -159,10 +159,10 @@ class EpisodeBatch(Runs):
             beside = self.reference.predict(beside, *inputs_of(start.control))
             beside = self.reference.observe(beside, measurement)
             self._full_state = beside if everyone else merge_runs(self._full_state, beside, runs)
-        if len(task.network.delay) > 1:
+        if task.delayed:
             nothing = np.zeros((task.sensors, len(runs)), dtype=np.bool_)
             last = state.estimate, measurement, nothing, state.control
-            state = state._replace(history=(last,) * (len(task.network.delay) - 1))
+            state = state._replace(history=(last,) * task.network.longest_delay)
         self.state = state if everyone else merge_runs(self.state, state, runs)
 
     def step(self, requests: NDArray[Any], run: int | None = None) -> Outcome:

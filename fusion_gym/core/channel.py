@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -43,10 +42,10 @@ class ChannelOptions(OptionGroup):
     drop_probability: Annotated[ArrayLike | None, Scaling()] = None
     """Probability of a loss. Independent: one number, or one per sensor, by default 0.2; with
     ``access="assignment"`` also a matrix (sensors, channels). Gilbert-Elliott: the pair (bad,
-    good), by default (0.7, 0.2)."""
+    good), or a row of it per sensor, by default (0.7, 0.2)."""
     channel_transition: Annotated[ArrayLike | None, Scaling()] = None
-    """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel.
-    By default ((0.7, 0.3), (0.1, 0.9))."""
+    """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel:
+    a matrix, or one per sensor. By default ((0.7, 0.3), (0.1, 0.9))."""
     initial_channel: Annotated[InitialState, Scaling()] = "stationary"
     """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
     law."""
@@ -60,8 +59,8 @@ class ChannelOptions(OptionGroup):
     are of its last packet. The scheduler always knows."""
     delay: Annotated[ArrayLike, Scaling(), NumpyOnly()] = 0
     """Steps from a transmission to its arrival, at most 100: a whole number, or a pair (least,
-    most) from which each packet draws uniformly. The fusion centre repeats its updates from the
-    time of a late packet on."""
+    most) from which each packet draws uniformly, or a row (least, most) per sensor. The fusion
+    centre repeats its updates from the time of a late packet on."""
 
 
 @dataclass(frozen=True)
@@ -102,16 +101,17 @@ class Channel:
 
     @cached_property
     def transition(self) -> Array:
-        """Probabilities (states, states) from the last state (row) to the next."""
+        """Probabilities (sensors · channels, states, states) from the last state (row) on."""
         if self.options.channel != "gilbert_elliott":
-            return np.ones((1, 1))
-        matrix: ArrayLike | None = self.options.channel_transition
-        matrix = _TRANSITION if matrix is None else matrix
-        matrix = validation.array("channel_transition", matrix, (2, 2))
-        if np.any(matrix < 0.0) or not np.allclose(matrix.sum(1), 1.0, rtol=0.0, atol=1e-9):
+            return np.ones((self.drop.shape[1], 1, 1))
+        value: ArrayLike | None = self.options.channel_transition
+        value = _TRANSITION if value is None else value
+        each = validation.array_shape(value) == (self.sensors, 2, 2)
+        matrix = validation.array("channel_transition", value, (self.sensors,) * each + (2, 2))
+        if np.any(matrix < 0.0) or not np.allclose(matrix.sum(-1), 1.0, rtol=0.0, atol=1e-9):
             reason = "it must have rows of probabilities that sum to 1"
             raise forbidden("channel_transition", matrix, reason)
-        return matrix
+        return self._by_link(matrix, (2, 2))
 
     @cached_property
     def drop(self) -> Array:
@@ -123,25 +123,29 @@ class Channel:
         if kind != "gilbert_elliott":
             drop = validation.by_row(drop, shape) if self.channels else drop
             return _probabilities("drop_probability", drop, shape).reshape(1, -1)
-        if validation.array_shape(drop) != (2,):
-            allowed = "a pair of probabilities (bad, good)"
+        own = validation.array_shape(drop)
+        if own not in ((2,), (self.sensors, 2)):
+            allowed = "a pair of probabilities (bad, good), or a row of it per sensor"
             raise validation.refusal("drop_probability", drop, allowed)
-        pair = _probabilities("drop_probability", drop, (2,))
-        return np.repeat(pair[:, None], math.prod(shape), axis=1)
+        return self._by_link(_probabilities("drop_probability", drop, own), (2,)).T
+
+    def _by_link(self, value: Array, shape: tuple[int, ...]) -> Array:
+        """Return a value for all or each of the sensors as one for each link."""
+        return np.repeat(np.broadcast_to(value, (self.sensors, *shape)), self.channels or 1, axis=0)
 
     @cached_property
     def initial(self) -> Array:
-        """Distribution (states,) of S(0)."""
+        """Distributions (states, sensors · channels) of S(0)."""
         initial, matrix = self.options.initial_channel, self.transition
-        if len(matrix) == 1:
-            return np.ones(1)
+        if matrix.shape[-1] == 1:
+            return np.ones((1, len(matrix)))
         if initial != "stationary":
-            return np.eye(2)[STATES.index(initial)]
-        leaves = matrix[[0, 1], [1, 0]]
-        if leaves.sum() == 0.0:
+            return np.repeat(np.eye(2)[:, [STATES.index(initial)]], len(matrix), axis=1)
+        leaves = matrix[:, [0, 1], [1, 0]].T
+        if np.any(leaves.sum(0) == 0.0):
             where = "with a channel that never changes"
             raise validation.refusal("initial_channel", "stationary", "'bad' or 'good'", where)
-        return np.asarray(leaves[::-1] / leaves.sum())
+        return np.asarray(leaves[::-1] / leaves.sum(0))
 
     @cached_property
     def truth(self) -> tuple[float, float] | None:
@@ -185,11 +189,12 @@ class Channel:
 
     def start(self, noise: Array) -> NDArray[np.int64]:
         """Return S(0), shape (sensors, N), from standard normals (sensors, N)."""
-        return _choose(self.initial[:, None, None], noise)
+        return _choose(self.initial[..., None], noise)
 
     def advance(self, state: NDArray[np.int64], noise: Array) -> NDArray[np.int64]:
         """Return S(t), shape (sensors, N), from S(t-1) and standard normals (sensors, N)."""
-        return _choose(namespace(state).asarray(self.transition.T)[:, state], noise)
+        following, link = np.moveaxis(self.transition, -1, 0), np.arange(len(state))[:, None]
+        return _choose(namespace(state).asarray(following)[:, link, state], noise)
 
     def lost(
         self, state: NDArray[np.int64], noise: Array, truth: Array | None = None
@@ -235,17 +240,23 @@ def make_acknowledgement(options: ChannelOptions) -> float:
     return validation.number("acknowledgements", value, at_least=0.0, at_most=1.0)
 
 
-def make_delay(options: ChannelOptions) -> tuple[float, ...]:
-    """Return the probabilities of a delay of 0, 1, … steps."""
+def make_delay(options: ChannelOptions, sensors: int) -> Array:
+    """Return the probabilities (sensors, D + 1) of a delay of 0, 1, … steps."""
     value: Any = options.delay
-    pair = isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) > 0
-    ends = value if pair else (value, value)
-    if len(ends) == 2:
-        least, most = (
-            validation.integer("delay", end, at_least=0, at_most=_LONGEST) for end in ends
-        )
-        if least < most or not pair:
-            count = most + 1 - least
-            return (0.0,) * least + (1.0 / count,) * count
-    allowed = "a whole number, or a pair (least, most), least < most"
-    raise validation.refusal("delay", value, allowed)
+    shape = validation.array_shape(value)
+    allowed = (
+        "a whole number, a pair (least, most), least < most, or a row (least, most) per sensor"
+    )
+    if shape not in ((), (2,), (sensors, 2)):
+        raise validation.refusal("delay", value, allowed)
+    rows = value if shape == (sensors, 2) else [value if shape else (value, value)] * sensors
+    ends = [
+        [validation.integer("delay", end, at_least=0, at_most=_LONGEST) for end in row]
+        for row in rows
+    ]
+    result = np.zeros((sensors, 1 + max(most for _, most in ends)))
+    for own, (least, most) in zip(result, ends, strict=True):
+        if least > most or (shape == (2,) and least == most):
+            raise validation.refusal("delay", value, allowed)
+        own[least : most + 1] = 1.0 / (most + 1 - least)
+    return result

@@ -187,9 +187,9 @@ class Network:
         return None if self.options.channel == "perfect" else channel
 
     @cached_property
-    def delay(self) -> tuple[float, ...]:
-        """Probabilities of a delay of 0, 1, … steps, drawn for each packet."""
-        return make_delay(self.options)
+    def delay(self) -> Array:
+        """Probabilities (l, D + 1) of a delay of 0, 1, … steps, drawn for each packet."""
+        return make_delay(self.options, self.sensors)
 
     @cached_property
     def acknowledgement(self) -> float:
@@ -218,7 +218,7 @@ class Network:
         sizes = {
             "following": links * (channel is not None and channel.states > 1),
             "lost": links * (channel is not None and channel.loses),
-            "delay": sensors * (len(self.delay) > 1),
+            "delay": sensors * (self.longest_delay > 0),
             "unreported": sensors * (0.0 < self.acknowledgement < 1.0),
             "frequency": sensors * (self.rule.contended and self.options.channels > 1),
             "harvest": sensors * (self.bucket.draws_harvest and not self.bucket.unlimited),
@@ -231,9 +231,15 @@ class Network:
         return self.slots if self.rule.by_channel else 1
 
     @cached_property
-    def _longest(self) -> int:
+    def longest_delay(self) -> int:
         """Largest delay D, in steps."""
-        return len(self.delay) - 1
+        return self.delay.shape[1] - 1
+
+    @cached_property
+    def _longer(self) -> Array:
+        """Uniform numbers (D, l, 1) from which on a delay is longer than 0, …, D - 1 steps."""
+        possible = self.delay[:, :0:-1].cumsum(1)[:, ::-1] > 0.0
+        return np.where(possible, self.delay.cumsum(1)[:, :-1], 2.0).T[..., None]
 
     def start(self, noise: Array) -> NetworkState:
         """Return the state at time 0.
@@ -241,7 +247,7 @@ class Network:
         Args:
             noise: Standard normals (start_channels, N).
         """
-        runs, longest = noise.shape[-1], self._longest
+        runs, longest = noise.shape[-1], self.longest_delay
         channel = true_drop = None
         if self.channel is not None:
             channel = self.channel.start(noise) if "following" in self._normals else None
@@ -295,8 +301,7 @@ class Network:
             present = nothing if draws.following is None else draws.following
             draws.lost = self.channel.lost(present, own["lost"], state.true_drop)
         if "delay" in own:
-            reached = np.cumsum(self.delay)[:-1, None, None]
-            draws.delay = (ndtr(own["delay"]) >= reached).sum(0)
+            draws.delay = (ndtr(own["delay"]) >= self._longer).sum(0)
         if "unreported" in own:
             draws.unreported = ndtr(own["unreported"]) >= self.acknowledgement
         if "frequency" in own:
@@ -373,7 +378,7 @@ class Network:
         Args:
             state: State after :meth:`deliver`, before the next step.
         """
-        steps = np.arange(1, self._longest + 1)
+        steps = np.arange(1, self.longest_delay + 1)
         return None if state.due is None else state.due == steps[:, None, None]
 
     def link_probability(self, state: NetworkState) -> Array | None:
@@ -385,17 +390,18 @@ class Network:
         Args:
             state: State before the requests.
         """
-        if "lost" not in self._normals and not self._longest:
+        if "lost" not in self._normals and not self.longest_delay:
             return None
         runs = state.queue.shape[-1]
         arrival: Any = np.ones((self.sensors * self._channels, runs))
         if self.channel is not None and state.channel is not None:
             link = np.arange(len(arrival))[:, None]
-            loss = namespace(state.channel).asarray(self.channel.transition @ self.channel.drop)
-            arrival = 1.0 - loss[state.channel, link]
+            loss = (self.channel.transition @ self.channel.drop.T[..., None])[..., 0]
+            arrival = 1.0 - namespace(state.channel).asarray(loss)[link, state.channel]
         elif self.channel is not None:
             arrival = arrival - self.channel.drop[0][:, None]
-        arrival = self.delay[0] * arrival if self._longest else arrival
+        if self.longest_delay:
+            arrival = np.repeat(self.delay[:, :1], self._channels, axis=0) * arrival
         return arrival.reshape(self.sensors, -1, runs)
 
 

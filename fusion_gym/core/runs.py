@@ -466,7 +466,7 @@ def receive(
     control = control_of(task, state.plant, estimate)
     if task.delayed:
         last = state.estimate, task.plant.measurement(state.plant), arrived, control
-        history = (*history, last)[1 - len(task.network.delay) :]
+        history = (*history, last)[-task.network.longest_delay :]
     after = state._replace(estimate=estimate, network=network, supposed=supposed)
     return after._replace(history=history, control=control)
 

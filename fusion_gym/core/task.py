@@ -321,7 +321,7 @@ class Task(Scenario):
     @functools.cached_property
     def delayed(self) -> bool:
         """Whether the network delays packets."""
-        return len(self.network.delay) > 1
+        return self.network.longest_delay > 0
 
     @property
     def knowledge(self) -> Knowledge:

@@ -63,16 +63,17 @@ def age_sources(task: Task, longest: int = _LONGEST) -> tuple[AgeSource, ...]:
     price = (task.reward.price.fixed or 0.0) * network.bucket.cost[:, 0]
     for place, growth in enumerate(np.square(model.radii)):
         own = channel.drop[:, links * place : links * (place + 1)].min(1)  # of the best channel
-        loss = np.abs(np.linalg.eigvals(channel.transition * own)).max()
+        loss = np.abs(np.linalg.eigvals(channel.transition[links * place] * own)).max()
         if growth * loss >= 1.0:
             raise ConfigurationError(
                 f"sources[{place}] with this channel is not allowed: the cost of permanent "
                 f"transmissions is infinite (growth {growth:.4g} times loss {loss:.4g} is >= 1)"
             )
     ends, more = longest + 1, longest - 1
+    parts = zip(every, price.repeat(links), channel.drop.T, channel.transition, strict=True)
     return tuple(
-        AgeSource(own[:ends], float(cost), drop, channel.transition, _growth(own[more:]))
-        for own, cost, drop in zip(every, price.repeat(links), channel.drop.T, strict=True)
+        AgeSource(own[:ends], float(cost), drop, transition, _growth(own[more:]))
+        for own, cost, drop, transition in parts
     )
 
 

@@ -76,8 +76,8 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
             price=reward.price.fixed * float(task.network.bucket.cost[i, 0]),
             error_weight=float(weights[i]),
             drop=channel.drop[:, i],
-            transition=channel.transition,
-            initial=channel.initial,
+            transition=channel.transition[i],
+            initial=channel.initial[:, i],
         )
         for i in range(system.sensor_count)
     )

@@ -126,9 +126,10 @@ def test_estimates_are_those_of_all_arrivals(
     assert (late > 0) == (delay != 0)
 
 
-def test_late_packets_are_those_of_a_separate_kalman_filter() -> None:
+@pytest.mark.parametrize("delay", [DELAY, ((0, 0), (1, 3))])
+def test_late_packets_are_those_of_a_separate_kalman_filter(delay: Any) -> None:
     """Which has all arrivals, one after another."""
-    log = Log(make_task("LinearFusion-v2", {}, 0.2, DELAY))
+    log = Log(make_task("LinearFusion-v2", {}, 0.2, delay))
     plant: Any = log.task.plant
     transition, process = (
         plant.dynamics.transition[..., 0],
@@ -154,6 +155,60 @@ def test_late_packets_are_those_of_a_separate_kalman_filter() -> None:
             estimate = log.batch.delivered.estimate
             np.testing.assert_allclose(estimate.mean[:, run], mean, atol=1e-12)
             np.testing.assert_allclose(estimate.covariance[..., run], covariance, atol=1e-12)
+
+
+def test_each_sensor_has_a_delay_of_its_own() -> None:
+    """A source's estimate is its last arrived value, aged by the sensor's own delay."""
+    delays, coefficient = (0, 1, 3), np.array([[0.9], [0.95], [1.0]])
+    rows = [(delay, delay) for delay in delays]
+    options = {"sensors": 3, "coefficient": coefficient[:, 0].tolist()}
+    batch = EpisodeBatch.seeded(make_task("RemoteEstimation-v1", options, 0.0, rows), RUNS, 0)
+    truth, sent = [], np.random.default_rng(1).random((STEPS, 3, RUNS)) < 0.5
+    for now, request in enumerate(sent):
+        truth.append(batch.task.plant.truth(batch.state.plant))
+        batch.step(request)
+        mean = batch.task.estimator.mean(batch.delivered.estimate)
+        for sensor, run in np.ndindex(3, RUNS):
+            there = np.flatnonzero(sent[: max(now + 1 - delays[sensor], 0), sensor, run])
+            last = int(there[-1]) if len(there) else None
+            if last is not None:
+                expected = coefficient[sensor, 0] ** (now - last) * truth[last][sensor, run]
+                np.testing.assert_allclose(mean[sensor, run], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_each_sensor_has_a_chain_of_its_own() -> None:
+    """The shares of losses follow from each chain, and so does what a policy expects."""
+    drop, stay = np.array([[1.0, 0.0], [0.8, 0.1], [0.5, 0.5]]), np.array([0.5, 0.9, 0.7])
+    transition = [[[s, 1.0 - s], [0.2, 0.8]] for s in stay]
+    lossy = {"channel": "gilbert_elliott", "drop_probability": drop, "horizon": 200}
+    options = lossy | {"channel_transition": transition, "tokens": "unlimited", "access": "any"}
+    task = fusion_gym.make_task("fusion_gym/CorrelatedTracking-v1", **options)
+    batch, arrived, expected = EpisodeBatch.seeded(task, 100, 3), [], []
+    for _ in range(200):
+        expected.append(batch.signals()["arrival_probability"].mean(1))
+        arrived.append(batch.step(np.ones((3, 100), dtype=np.bool_)).arrived.mean(1))
+    bad = 0.2 / (0.2 + 1.0 - stay)
+    share = 1.0 - (bad * drop[:, 0] + (1.0 - bad) * drop[:, 1])
+    np.testing.assert_allclose(np.mean(arrived, 0), share, atol=0.02)
+    np.testing.assert_allclose(np.mean(expected, 0).ravel(), share, atol=0.02)
+
+
+def test_a_source_is_solved_on_its_own_chain() -> None:
+    """Two sources with two chains are two tasks of one source."""
+    chains = [((0.9, 0.1), [[0.7, 0.3], [0.1, 0.9]]), ((0.6, 0.0), [[0.2, 0.8], [0.4, 0.6]])]
+
+    def problems(*chosen: Any) -> Any:
+        drop, transition = zip(*chosen, strict=True)
+        own: Options = {"channel": "gilbert_elliott", "sensors": len(chosen), "action": "discrete"}
+        own |= {"drop_probability": drop, "channel_transition": transition, "cost_weight": 0.5}
+        task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", **own | FREE)
+        return fusion_gym.solvers.source_problems(task)
+
+    together = problems(*chains)
+    for chain, problem in zip(chains, together, strict=True):
+        (alone,) = problems(chain)
+        for name in ("drop", "transition", "initial"):
+            np.testing.assert_array_equal(getattr(alone, name), getattr(problem, name))
 
 
 def test_a_lossy_network_leaves_the_plant_as_it_is() -> None:
@@ -268,6 +323,12 @@ def test_filters_are_consistent_under_losses(name: str, options: Options, drop: 
         (
             {"channel": "gilbert_elliott", "drop_probability": 0.5},
             "drop_probability",
+        ),
+        ({"delay": ((1, 0), (0, 0))}, "delay"),
+        ({"delay": (2, 2)}, "delay"),
+        (
+            {"channel": "gilbert_elliott", "channel_transition": np.ones((3, 2, 2)) / 2},
+            "channel_transition",
         ),
         ({"channel": "independent", "true_drop_probability": (0.4, 0.2)}, "true_drop_probability"),
         ({"channel": "noisy"}, "channel"),

@@ -129,11 +129,17 @@ VARIANTS: dict[str, list[Options]] = {
     ],
 }
 # Options of the network, beside those with recorded figures.
+CHAINS: Options = {  # other losses of each sensor
+    "channel": "gilbert_elliott", "drop_probability": ((0.9, 0.1), (0.5, 0.0), (0.3, 0.2)),
+    "channel_transition": (((0.5, 0.5), (0.1, 0.9)), ((0.7, 0.3), (0.3, 0.7)), np.eye(2)),
+    "initial_channel": "good",
+}  # fmt: skip
 NETWORKS: dict[str, list[Options]] = {
     "CorrelatedTracking": [
         {"channel": "gilbert_elliott", "acknowledgements": "none", "memory": True},
         {"access": "try_once_discard", "discrepancy": "held"} | SCARCE,
         {"delay": 2},
+        CHAINS | {"delay": ((0, 0), (2, 2), (0, 1)), "memory": True},
         {"budget": "sensor", "harvest": "bernoulli", "memory": True} | SCARCE,
         PAIRS | {"channel": "independent", "drop_probability": QUALITY, "memory": True},
         {"schedule": {"process_variance": (0.1, 0.3, 0.2), "end": "hold"}, "memory": True},

@@ -118,7 +118,7 @@ def contents(runs: Any) -> list[bytes]:
         runs.state.network.queue,
     ]
     beliefs = runs.beliefs()
-    late = len(runs.task.network.delay) > 1
+    late = runs.task.delayed
     observation += [beliefs.best.mean, beliefs.difference if late else beliefs.value]
     return [np.ascontiguousarray(part).tobytes() for part in observation]
 
