@@ -226,6 +226,12 @@ NETWORK_SIGNALS = (
         "own",
     ),
     Signal(
+        "variance_order",
+        "centre",
+        "(sensors, N)",
+        "a score in the order of `variance_reduction`, which a delay does not exclude",
+    ),
+    Signal(
         "link_probability",
         "centre",
         "(sensors, channels, N)",

@@ -381,7 +381,7 @@ class Network:
         steps = np.arange(1, self.longest_delay + 1)
         return None if state.due is None else state.due == steps[:, None, None]
 
-    def link_probability(self, state: NetworkState) -> Array | None:
+    def link_probability(self, state: NetworkState, late: bool = False) -> Array | None:
         """Return the probability (l, k, N) that a packet sent now, alone, arrives now.
 
         It follows from the channels' state that was fed back; ``None`` is 1. k is the number of
@@ -389,8 +389,9 @@ class Network:
 
         Args:
             state: State before the requests.
+            late: Whether later arrivals count.
         """
-        if "lost" not in self._normals and not self.longest_delay:
+        if "lost" not in self._normals and (late or not self.longest_delay):
             return None
         runs = state.queue.shape[-1]
         arrival: Any = np.ones((self.sensors * self._channels, runs))
@@ -400,7 +401,7 @@ class Network:
             arrival = 1.0 - namespace(state.channel).asarray(loss)[link, state.channel]
         elif self.channel is not None:
             arrival = arrival - self.channel.drop[0][:, None]
-        if self.longest_delay:
+        if self.longest_delay and not late:
             arrival = np.repeat(self.delay[:, :1], self._channels, axis=0) * arrival
         return arrival.reshape(self.sensors, -1, runs)
 

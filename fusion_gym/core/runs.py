@@ -284,9 +284,12 @@ class Runs:
         """Return the beliefs of the memory's owner before any transmission."""
         return self.memory.beliefs(self.state.estimate, self.arrival_probability())
 
-    def arrival_probability(self) -> Array | None:
-        """Return the probability (sensors, N) that a packet sent now arrives; ``None`` is 1."""
-        links = self.task.network.link_probability(self.state.network)
+    def arrival_probability(self, late: bool = False) -> Array | None:
+        """Return the probability (sensors, N) that a packet sent now arrives, now or also late.
+
+        ``None`` is 1.
+        """
+        links = self.task.network.link_probability(self.state.network, late)
         return None if links is None else links.max(1)
 
     def admitted(self) -> NDArray[np.bool_]:
@@ -316,12 +319,14 @@ class Runs:
         failure = None if arrival is None else 1.0 - arrival
         values = dict(self.task.estimator.read(self.known_to(local), failure))
         reduction: Any = values.get("variance_reduction")
-        if arrival is not None and reduction is not None:
-            values |= {
-                "variance_reduction": lambda: (
-                    arrival * (reduction() if callable(reduction) else reduction)
-                )
-            }
+        if reduction is not None:
+
+            def expect(arrival: Array | None) -> Array:
+                value: Array = reduction() if callable(reduction) else reduction
+                return value if arrival is None else arrival * value
+
+            values["variance_reduction"] = lambda: expect(arrival)
+            values["variance_order"] = lambda: expect(self.arrival_probability(late=True))
         return values
 
     def signals(self) -> Signals:

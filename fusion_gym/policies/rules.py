@@ -369,11 +369,11 @@ class VarianceThreshold(Rule):
 
     def __call__(self, signals: Signals) -> Requests:
         """Return the requests (sensors, N)."""
-        reduction = signals["variance_reduction"]
-        due = namespace(reduction).broadcast_to(
-            signals["silent_variance"] >= self.threshold, reduction.shape
+        order = signals["variance_order"]
+        due = namespace(order).broadcast_to(
+            signals["silent_variance"] >= self.threshold, order.shape
         )
-        return strongest(reduction, due, self.at_most, signals["age"])
+        return strongest(order, due, self.at_most, signals["age"])
 
 
 @dataclass

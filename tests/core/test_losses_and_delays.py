@@ -193,6 +193,22 @@ def test_each_sensor_has_a_chain_of_its_own() -> None:
     np.testing.assert_allclose(np.mean(expected, 0).ravel(), share, atol=0.02)
 
 
+@pytest.mark.parametrize("env_id", ["CorrelatedTracking-v1", "TobitOscillator-v1"])
+def test_a_rule_that_needs_an_order_alone_runs_under_a_delay(env_id: str) -> None:
+    """Its first requests are those without the delay."""
+    first = []
+    for delay in (0, 2):
+        task = make_task(env_id, {}, 0.3, delay)
+        batch = EpisodeBatch.seeded(task, RUNS, 0)
+        rule = fusion_gym.make_policy("variance_threshold:threshold=0,at_most=2", task)
+        first.append(rule(batch.signals()))
+    np.testing.assert_array_equal(*first)
+    assert (first[0].sum(0) == 2).all()
+    assert (first[0].sum(1) < RUNS).any()
+    with pytest.raises(ConfigurationError, match="variance_reduction"):
+        fusion_gym.make_policy("information_gain", task)
+
+
 def test_a_source_is_solved_on_its_own_chain() -> None:
     """Two sources with two chains are two tasks of one source."""
     chains = [((0.9, 0.1), [[0.7, 0.3], [0.1, 0.9]]), ((0.6, 0.0), [[0.2, 0.8], [0.4, 0.6]])]
