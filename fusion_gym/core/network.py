@@ -62,9 +62,10 @@ class NetworkState:
     ``tokens`` (N,), or (l, N) of each sensor's own bucket · ``queue`` (l, N), the place of each
     sensor · ``admitted`` (l, N) bool, the sensors with a reading that the access rule admits ·
     ``channel`` (l, N), the channels' state at the step before, which is fed back, as
-    ``Draws.following`` · ``place`` (l, N), 0 for the largest discrepancy. Hidden are ``draws``,
-    ``due`` (D, l, N), the delay of the packet that was sent 1, …, D steps ago, 0 without one, and
-    ``true_drop`` (N,), the true probability of a loss. ``None`` is absent.
+    ``Draws.following`` · ``place`` (l, N), 0 for the largest discrepancy · ``token_rate`` (N,) of
+    an episode. Hidden are ``draws``, ``due`` (D, l, N), the delay of the packet that was sent 1, …,
+    D steps ago, 0 without one, and ``true_drop`` (N,), the true probability of a loss. ``None`` is
+    absent.
     """
 
     tokens: Array
@@ -74,6 +75,7 @@ class NetworkState:
     place: NDArray[np.int64] | None = None
     due: NDArray[np.int64] | None = None
     true_drop: Array | None = None
+    token_rate: Array | None = None
     draws: Draws = field(default_factory=Draws)
 
     @property
@@ -199,7 +201,8 @@ class Network:
     @property
     def start_channels(self) -> int:
         """Number of standard normals that :meth:`start` takes per run."""
-        return 0 if self.channel is None else self.channel.start_channels
+        own = 0 if self.channel is None else self.channel.start_channels
+        return own + (self.bucket.rate_range is not None)
 
     @property
     def draw_channels(self) -> int:
@@ -250,14 +253,15 @@ class Network:
         runs, longest = noise.shape[-1], self.longest_delay
         channel = true_drop = None
         if self.channel is not None:
-            channel = self.channel.start(noise) if "following" in self._normals else None
-            true_drop = self.channel.begin(noise)
+            own = noise[: self.channel.start_channels]
+            channel = self.channel.start(own) if "following" in self._normals else None
+            true_drop = self.channel.begin(own)
         due = np.zeros((longest, self.sensors, runs), dtype=np.int64) if longest else None
         everyone = np.ones((self.sensors, runs), dtype=np.bool_)
         bucket = self.bucket
         tokens, queue = bucket.start(runs), bucket.start_queue(runs)
-        draws = Draws(channel)
-        return NetworkState(tokens, queue, everyone, channel, None, due, true_drop, draws)
+        rest = true_drop, bucket.start_rate(noise), Draws(channel)
+        return NetworkState(tokens, queue, everyone, channel, None, due, *rest)
 
     def advance(
         self,
@@ -280,7 +284,7 @@ class Network:
             admitted = own if readings is None else own & readings
         noise = noise[1:] if self.rule.random else noise
         following = state.draws.following
-        old = state.tokens, state.queue, state.due, state.true_drop
+        old = state.tokens, state.queue, state.due, state.true_drop, state.token_rate
         moved = _moved(*old, admitted, following, following)
         return self.draw(moved, noise) if len(noise) else moved
 
@@ -319,8 +323,9 @@ class Network:
         if self.rule.limited:
             place = queue if state.place is None else state.place[:, runs]
             requests = first_requests(requests, place, self.slots)
-        harvest = None if state.draws.harvest is None else state.draws.harvest[:, runs]
-        return self.bucket.grant(state.tokens[..., runs], requests, queue, harvest)
+        gained = state.draws.harvest if state.token_rate is None else state.token_rate
+        gained = None if gained is None else gained[..., runs]
+        return self.bucket.grant(state.tokens[..., runs], requests, queue, gained)
 
     def deliver(
         self, state: NetworkState, requests: NDArray[Any], reads_silence: bool = False
@@ -354,8 +359,8 @@ class Network:
             arrival = self.link_probability(state)
             failure = None if arrival is None else 1.0 - arrival[:, 0]
             reception = reception._replace(possible=possible, failure=failure)
-        channels = state.channel, state.draws.following
-        moved = _moved(tokens, queue, due, state.true_drop, state.admitted, *channels)
+        constant = state.true_drop, state.token_rate, state.admitted
+        moved = _moved(tokens, queue, due, *constant, state.channel, state.draws.following)
         return moved, Delivery(granted, spent, reception, supposed)
 
     def _lost(
@@ -411,12 +416,14 @@ def _moved(
     queue: Queue,
     due: Any,
     true_drop: Any,
+    token_rate: Any,
     admitted: Any,
     channel: Any,
     following: Any,
 ) -> NetworkState:
     """Return a state without draws of its own, by its constructor, which is faster than a copy."""
-    return NetworkState(tokens, queue, admitted, channel, None, due, true_drop, Draws(following))
+    rest = due, true_drop, token_rate, Draws(following)
+    return NetworkState(tokens, queue, admitted, channel, None, *rest)
 
 
 def warn_of_uneven_grants(network: Network) -> None:

@@ -90,6 +90,13 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         lambda runs: price.encode(runs.price),
         constants={} if price.span is None else {"range": price.span},
     )
+    high = max(bucket.rate_range or (1.0,))
+    rate = shared(
+        "token_rate",
+        "tokens per step over the high end of the range",
+        lambda runs: runs.state.network.token_rate / high,
+        constants={"high": high},
+    )
     queues = bucket.sharing == "turns" and not bucket.unlimited
     return (
         *((channels,) if channel is not None and channel.states > 1 else ()),
@@ -97,6 +104,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         *((admitted,) if task.network.rule.turn is not None else ()),
         *((queue,) if queues else ()),
         *((left,) if task.options.clock else ()),
+        *((rate,) if bucket.rate_range is not None else ()),
         *((block,) if price.span is not None else ()),
     )
 

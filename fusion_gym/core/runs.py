@@ -337,8 +337,9 @@ class Runs:
         ``price`` (N,), ``step`` (N,) (steps taken), ``queue`` (sensors, N) (0 for the sensor
         granted least recently), ``start`` (N,) bool, ``admitted`` and ``grantable`` (sensors, N)
         bool, ``observation`` (N, entries), ``estimate`` (the estimator's state), with a controller
-        its last input ``control`` (k, N), and the channels and beliefs of
-        :mod:`fusion_gym.core.knowledge`. Policies of single sensors read what these suppose.
+        its last input ``control`` (k, N), with a range of rates ``token_rate`` (N,), and the
+        channels and beliefs of :mod:`fusion_gym.core.knowledge`. Policies of single sensors read
+        what these suppose.
         """
         nodes = None if self.state.supposed is None else self._signals(local=True)
         return self._signals(nodes=nodes)
@@ -362,6 +363,7 @@ class Runs:
             "estimate": self.state.estimate,
         }
         values |= {} if self.state.control is None else {"control": self.state.control}
+        values |= {} if network.token_rate is None else {"token_rate": network.token_rate}
         values |= self.memory.signals(self.beliefs)
         return Signals(values, self.task.hidden_signals, self.memory.missing_signals, nodes)
 

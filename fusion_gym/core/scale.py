@@ -201,8 +201,11 @@ def _above(left: int, middle: int, right: int, rate: Array, error: Array) -> boo
 
 
 def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
-    """Return a batch of ``copies`` copies of the simulation's runs."""
-    batch = EpisodeBatch(task.with_options(horizon=min(task.horizon, _STEPS)), runs * copies)
+    """Return a batch of ``copies`` copies of the simulation's runs, at the typical token rate."""
+    bucket = task.network.bucket
+    typical = {} if bucket.rate_range is None else {"token_rate": bucket.rate}
+    task = task.with_options(horizon=min(task.horizon, _STEPS), **typical)
+    batch = EpisodeBatch(task, runs * copies)
     batch.seed(np.arange(runs * copies), [*seeds.SCALE[:runs]] * copies)
     batch.reset()
     return batch

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.declaration import OptionGroup, Scaling
 from fusion_gym.errors import ConfigurationError, forbidden, refusal
-from fusion_gym.namespace import namespace, ranked_sum
+from fusion_gym.namespace import namespace, ndtr, ranked_sum
 
 Tokens = Literal["limited", "unlimited"]
 SharingRule = Literal["equal", "fixed", "turns"]
@@ -58,7 +58,9 @@ class BucketOptions(OptionGroup):
     """Tokens that a bucket gains per step: ``token_rate`` (``"constant"``), or with
     ``budget="sensor"`` one token with the probability ``token_rate`` (``"bernoulli"``)."""
     token_rate: Annotated[ArrayLike, Scaling()] = 5.0
-    """Tokens g that the bucket gains per step (tobit_token_bucket, equation (17))."""
+    """Tokens g that the bucket gains per step (tobit_token_bucket, equation (17)). With
+    ``budget="shared"`` a pair (low, high) is a range, from which each episode draws uniformly. The
+    observation and the signal ``token_rate`` show the episode's rate."""
     token_capacity: Annotated[ArrayLike, Scaling()] = 30.0
     """Largest number b of tokens in the bucket (tobit_token_bucket, equation (17))."""
     initial_tokens: Annotated[ArrayLike, Scaling()] = 10.0
@@ -127,7 +129,11 @@ class TokenBucket:
             most = validation.display(options.token_capacity) if each else f"{limit:g}"
             reason = f"with token_capacity = {most} it must be >= 0 and <= {most}"
             raise forbidden("initial_tokens", options.initial_tokens if each else start, reason)
-        self._numbers("token_rate", at_least=0.0, at_most=1.0 if self.draws_harvest else None)
+        if self.rate_range is None:
+            self._numbers("token_rate", at_least=0.0, at_most=1.0 if self.draws_harvest else None)
+        elif self.unlimited:
+            where = "with tokens='unlimited'"
+            raise forbidden("token_rate", options.token_rate, "a range has no use", where)
 
     def _numbers(self, name: str, **limits: float | None) -> Array | float:
         """Return the checked numbers of an option: one, or (sensors, 1) of each sensor's bucket."""
@@ -144,8 +150,22 @@ class TokenBucket:
 
     @cached_property
     def rate(self) -> Array | float:
-        """Tokens per step."""
-        return self._numbers("token_rate")
+        """Tokens per step, typical ones with a range."""
+        return self._numbers("token_rate") if self.rate_range is None else sum(self.rate_range) / 2
+
+    @cached_property
+    def rate_range(self) -> tuple[float, float] | None:
+        """Range (low, high) of the tokens per step of an episode; ``None`` is :attr:`rate`."""
+        value: Any = self.options.token_rate
+        shape = validation.array_shape(value)
+        if self.per_sensor or shape == ():
+            return None
+        ends = value if shape == (2,) else (0.0, 0.0)
+        low, high = (validation.number("token_rate", end, at_least=0.0) for end in ends)
+        if not low < high:
+            allowed = "a number >= 0, or a pair (low, high) of such numbers, low < high"
+            raise refusal("token_rate", value, allowed)
+        return low, high
 
     @cached_property
     def capacity(self) -> Array | float:
@@ -190,7 +210,8 @@ class TokenBucket:
         fall on q of d groups of sensors in turn, evenly where d divides q.
         """
         costs = np.unique(self.cost)
-        if self.per_sensor or self.unlimited or len(costs) > 1 or not 0.0 < self.rate < costs[0]:
+        free = self.per_sensor or self.unlimited or self.rate_range is not None
+        if free or len(costs) > 1 or not 0.0 < self.rate < costs[0]:
             return False
         steps = Fraction(float(costs[0] / self.rate)).limit_denominator(1000)
         return steps.denominator % math.gcd(steps.numerator, len(self.cost)) != 0
@@ -207,6 +228,17 @@ class TokenBucket:
         shape = (len(self.cost), num_envs) if self.per_sensor else (num_envs,)
         return np.full(shape, self.capacity if self.unlimited else self.initial)
 
+    def start_rate(self, noise: Array) -> Array | None:
+        """Return the tokens per step (N,) of an episode; ``None`` is :attr:`rate`.
+
+        Args:
+            noise: Standard normals (channels, N), of which a range takes the last.
+        """
+        if self.rate_range is None:
+            return None
+        low, high = self.rate_range
+        return low + (high - low) * ndtr(noise[-1])
+
     def start_queue(self, num_envs: int) -> Queue:
         """Return the queue (sensors, num_envs) at the start of an episode, sensor 0 first."""
         return np.repeat(np.arange(len(self.cost))[:, None], num_envs, axis=1)
@@ -221,7 +253,7 @@ class TokenBucket:
         tokens: Array,
         requests: NDArray[np.bool_],
         queue: Queue | None = None,
-        harvest: NDArray[np.bool_] | None = None,
+        harvest: Array | NDArray[np.bool_] | None = None,
     ) -> Grants:
         """Return the grants for the requests of a step.
 
@@ -229,7 +261,7 @@ class TokenBucket:
             tokens: (N,), or (sensors, N) with a bucket for each sensor.
             requests: (sensors, N) bool.
             queue: (sensors, N), the order of ``"turns"``; by default sensor 0 is first.
-            harvest: Tokens (sensors, N) that the sensors gain; by default ``rate``.
+            harvest: Tokens (N,) or (sensors, N) that the buckets gain; by default ``rate``.
 
         Source: tobit_token_bucket, equations (16)-(18).
         """

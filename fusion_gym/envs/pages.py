@@ -2,6 +2,9 @@
 
 import re
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from fusion_gym.core.action import space_text
 from fusion_gym.core.knowledge import FEATURES, Block, covers, numbered
@@ -25,6 +28,7 @@ _NETWORK = {
     "admitted": 'only with `access="round_robin"` or `"random"`',
     "queue": 'only with `sharing="turns"` and limited tokens',
     "time_left": "only with `clock=True`",
+    "token_rate": "only with a range as `token_rate`",
     "price": "only with a `price_range`",
 }
 # Conditions of the belief blocks of the scheduler and of a local sensor.
@@ -98,10 +102,13 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     access = {name: getattr(usual, name) for name in unused} | {"access": "round_robin"}
     if task.network.rule.by_channel:
         access = {}
-    for bucket in ({"sharing": "turns"}, {"budget": "sensor", "sharing": usual.sharing}):
+    bucket = task.network.bucket
+    rates: Any = {} if bucket.per_sensor else {"token_rate": (0.0, 1.0)}
+    own = {"budget": "sensor", "sharing": usual.sharing, "token_rate": np.ravel(bucket.rate)}
+    for options in ({"sharing": "turns"} | rates, own):
         every = task.with_options(
             **access,
-            **bucket,
+            **options,
             tokens="limited",
             token_capacity=1e6,
             clock=True,

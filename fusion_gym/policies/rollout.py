@@ -71,6 +71,8 @@ class Imagination:
         known = NetworkState(tokens, signals["queue"][:, runs], signals["admitted"][:, runs])
         if task.network.channel is not None and task.network.channel.states > 1:
             known.channel = signals["channel_state"][..., runs].reshape(-1, len(runs))
+        if task.network.bucket.rate_range is not None:
+            known.token_rate = signals["token_rate"][runs]
         network = rank_requests(task, task.network.draw(known, rest_of_first), estimate)
         control = signals["control"][:, runs] if task.controller else None
         age, none = signals["age"], np.zeros(len(runs))  # which no decision uses

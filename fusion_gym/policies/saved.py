@@ -194,6 +194,7 @@ class ModelView:
         price_range: range of the price of a token; None for a fixed price.
         nominal_error: scale of the entries of beliefs (n,); None for none.
         rule: text of a priced_threshold, whose log ratios are the last entries; None for none.
+        rate_range: range of the token rate; None for one rate.
     """
 
     observation_names: tuple[str, ...] | None = None
@@ -201,6 +202,7 @@ class ModelView:
     price_range: tuple[float, float] | None = None
     nominal_error: tuple[float, ...] | None = None
     rule: str | None = None
+    rate_range: tuple[float, ...] | None = None
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> ModelView:
@@ -213,17 +215,22 @@ class ModelView:
             raise ConfigurationError("observation_names is not allowed: it must be a list of words")
         if not isinstance(rule, str | None):
             raise refusal("rule", rule, "a text")
+        rates = card_entry.get("rate_range")
         return cls(
             None if names is None else tuple(names),
             validation.boolean("local", card_entry.get("local", False)),
             None if span is None else Price.create("random", span).span,
-            None if error is None else _errors(error),
+            None if error is None else _numbers("nominal_error", error),
             rule,
+            None if rates is None else _numbers("rate_range", rates),
         )
 
     def on(self, task: Task) -> Task:
         """Return the task with the price and the scale of the model's training."""
-        span = task.reward.price.span
+        span, rates = task.reward.price.span, task.network.bucket.rate_range
+        if None not in (self.rate_range, rates) and self.rate_range != rates:
+            allowed = f"{display(self.rate_range)}, which the agent observes"
+            raise refusal("token_rate", rates, allowed)
         if None not in (self.price_range, span) and self.price_range != span:
             allowed = f"{display(self.price_range)}, which the agent observes, or left out"
             raise refusal("price_range", span, allowed)
@@ -270,6 +277,8 @@ def tag_model(
         "local": local,
         "price_range": task.reward.price.span,
     }
+    if task.network.bucket.rate_range is not None:
+        entries["rate_range"] = task.network.bucket.rate_range
     if task.nominal_error is not None:
         entries["nominal_error"] = task.nominal_error.tolist()
         entries["reward_scale"] = task.settings["reward_scale"]
@@ -343,8 +352,8 @@ def _table(data: Mapping[str, Any], key: str) -> Plain:
     return result
 
 
-def _errors(value: Any) -> tuple[float, ...]:
-    return tuple(validation.not_negative("nominal_error", value, np.shape(value)).tolist())
+def _numbers(name: str, value: Any) -> tuple[float, ...]:
+    return tuple(validation.not_negative(name, value, np.shape(value)).tolist())
 
 
 class ModelPolicy:

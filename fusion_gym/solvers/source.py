@@ -88,6 +88,9 @@ class TokenLevels:
         spent = (sets * bucket.cost).sum(0)
         if bucket.per_sensor and not bucket.unlimited:
             raise validation.refusal("budget", "sensor", "'shared'", "for the exact optimum")
+        if bucket.rate_range is not None:
+            rate = bucket.options.token_rate
+            raise validation.refusal("token_rate", rate, "one number", "for the exact optimum")
         start = float(np.max(bucket.start(1)))
         if bucket.unlimited:
             everything = np.ones((1, len(choices)), dtype=np.bool_)

@@ -156,7 +156,12 @@ NETWORKS: dict[str, list[Options]] = {
         {"filter": "local", "memory": True, "budget": "sensor", "delay": 1} | SCARCE,
     ],
     "RecordedFusion": [{"filter": "local", "memory": True, "budget": "sensor"} | SCARCE],
-    "TobitOscillator": [{"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE],
+    "TobitOscillator": [
+        {"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE,
+        {"channel": "independent", "true_drop_probability": (0.2, 0.6), "memory": True}
+        | SCARCE
+        | {"token_rate": (0.2, 3.0)},
+    ],
     "MarkovJumpTracking": [{"channel": "independent", "acknowledgements": 0.4}],
     "UnknownInput": [
         {"channel": "independent", "acknowledgements": "none"} | SCARCE,
@@ -189,6 +194,8 @@ class Case:
         """The task, with further options; those of the network are exchanged, which is quick."""
         if self.options.get("budget") == "sensor":  # nothing to share
             more.pop("sharing", None)
+        elif np.ndim(self.options.get("token_rate", 0.0)) and more.get("tokens") == "unlimited":
+            more = {"token_rate": 0.5} | more  # nothing to draw
         if more and more.keys() <= SCARCE.keys() | FREE.keys():
             task = self.task()
             if task.network.rule.by_channel:  # its links are those of the access

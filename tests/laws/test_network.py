@@ -104,6 +104,7 @@ def test_only_grants_cost_tokens_and_the_balance_closes(case: Case) -> None:
         for request in requests(batch.task, 3, STEPS):
             network, own = batch.state.network, selection["budget"] == "sensor"
             before, gained = network.energy.copy(), network.draws.harvest
+            gained = gained if network.token_rate is None else network.token_rate
             outcome = batch.step(request)
             assert not (outcome.granted & ~request).any()
             np.testing.assert_allclose(outcome.cost, cost @ outcome.granted)

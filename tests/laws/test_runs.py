@@ -160,6 +160,7 @@ FORMULAS: dict[str, Callable[[EpisodeBatch, Signals], Array]] = {
     "tokens": lambda b, s: b.tokens / b.task.settings["token_capacity"],
     "admitted": lambda b, s: b.admitted(),
     "queue": lambda b, s: b.state.network.queue / b.task.sensors,
+    "token_rate": lambda b, s: b.state.network.token_rate / b.task.settings["token_rate"][1],
     "time_left": lambda b, s: 1.0 - b.steps / b.task.horizon,
     "price": lambda b, s: place(b.price, *b.task.settings["price_range"]),
 }

@@ -256,6 +256,15 @@ def test_what_weights_do_not_make_needs_trust(
     refused(lambda: make_policy(f"model:{path}", task, trust=trust), "trust = 'yes'")
 
 
+def test_an_agent_of_a_range_of_token_rates_decides_in_this_range_only(tmp_path: Path) -> None:
+    model, task = Recipe(PPO, options={"token_rate": (2.0, 6.0)}).build()
+    tag_model(model, task)
+    model.save(path := tmp_path / "model.zip")
+    assert make_policy(f"model:{path}", task)
+    for rate, reason in (((1.0, 6.0), "token_rate = (1.0, 6.0)"), (4.0, "['token_rate']")):
+        refused_agent(path, fusion_gym.make_task(ENV, **OPTIONS, token_rate=rate), reason)
+
+
 HEAD, FIRST = "action_net.weight", "mlp_extractor.policy_net.0.weight"
 Parts = Callable[[Saved], tuple[Path, dict[str, bytes]]]
 
