@@ -254,9 +254,9 @@ def make_delay(options: ChannelOptions, sensors: int) -> Array:
         [validation.integer("delay", end, at_least=0, at_most=_LONGEST) for end in row]
         for row in rows
     ]
-    result = np.zeros((sensors, 1 + max(most for _, most in ends)))
-    for own, (least, most) in zip(result, ends, strict=True):
-        if least > most or (shape == (2,) and least == most):
-            raise validation.refusal("delay", value, allowed)
-        own[least : most + 1] = 1.0 / (most + 1 - least)
-    return result
+    least, most = np.array(ends).T[..., None]
+    if np.any(least > most) or (shape == (2,) and np.any(least == most)):
+        raise validation.refusal("delay", value, allowed)
+    steps = np.arange(most.max() + 1)
+    possible = (least <= steps) & (steps <= most)
+    return np.asarray(possible / possible.sum(1, keepdims=True))

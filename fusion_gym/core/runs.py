@@ -313,21 +313,23 @@ class Runs:
         """Return the sensors (sensors, N) whose single request the network would grant now."""
         return self.admitted() & self.task.network.bucket.affordable(self.state.network.tokens)
 
-    def read(self, local: bool = False) -> dict[str, Any]:
+    def read(self, local: bool = False, late: bool = False) -> dict[str, Any]:
         """Return the estimator's signals, with the network's probability of an arrival."""
-        arrival = self.arrival_probability()
+        arrival = self.arrival_probability(late)
         failure = None if arrival is None else 1.0 - arrival
         values = dict(self.task.estimator.read(self.known_to(local), failure))
         reduction: Any = values.get("variance_reduction")
-        if reduction is not None:
-
-            def expect(arrival: Array | None) -> Array:
-                value: Array = reduction() if callable(reduction) else reduction
-                return value if arrival is None else arrival * value
-
-            values["variance_reduction"] = lambda: expect(arrival)
-            values["variance_order"] = lambda: expect(self.arrival_probability(late=True))
+        if arrival is not None and reduction is not None:
+            values |= {
+                "variance_reduction": lambda: (
+                    arrival * (reduction() if callable(reduction) else reduction)
+                )
+            }
         return values
+
+    def _variance_order(self, local: bool) -> Any:
+        order = self.read(local, late=True)["variance_reduction"]
+        return order() if callable(order) else order
 
     def signals(self) -> Signals:
         """Return the signals of all runs, except those that the information mode withholds.
@@ -362,6 +364,8 @@ class Runs:
             "observation": functools.partial(self.observe, local),
             "estimate": self.state.estimate,
         }
+        if "variance_reduction" in values:
+            values |= {"variance_order": functools.partial(self._variance_order, local)}
         values |= {} if self.state.control is None else {"control": self.state.control}
         values |= {} if network.token_rate is None else {"token_rate": network.token_rate}
         values |= self.memory.signals(self.beliefs)

@@ -478,7 +478,7 @@ def test_sensors_with_memory_refuse_a_delay() -> None:
 
 OF_ONE_STEP = [
     "value_of_information", "kullback_leibler", "estimate_difference", "priced_threshold",
-    "priced_threshold:score=variance", "information_gain", "variance_threshold",
+    "priced_threshold:score=variance", "information_gain",
     "centre_variance", "optimal", "whittle", "periodic_optimum", "rollout:base=always",
 ]  # fmt: skip
 
