@@ -1,4 +1,4 @@
-"""Pictures of a running episode: states and estimates, requests and grants, tokens."""
+"""Pictures of a running episode: states and estimates, requests and packets, tokens."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ WINDOW = 60  # steps in a picture, at most
 _MOST_STATES = 4
 # Okabe and Ito's palette for colour-blind readers.
 _TRUTH, _ESTIMATE, _GRANTED, _DENIED, _TOKENS = "black", "#D55E00", "#0072B2", "0.55", "#009E73"
-_CENSORED = "#CC79A7"
+_CENSORED, _LOST, _LATE = "#CC79A7", "black", "#E69F00"
 _WIDTH, _STATE, _STRIP, _TOP, _BOTTOM = 640, 120, 70, 62, 44  # pixels
 
 
@@ -35,9 +35,10 @@ class Film:
     """The last steps of N runs of a task, and a picture of each run.
 
     A picture shows up to four states with the fused estimate and two claimed standard deviations,
-    one row of requests per sensor (granted or denied), the input of a controller, and the tokens
-    if they are limited. The censored range of a state is shaded. A plant's own picture stands
-    beside it.
+    one row of requests per sensor (granted or denied; if the network can lose or delay packets,
+    also lost or late, with a line to the arrival), the input of a controller, and the tokens if
+    they are limited. The censored range of a state is shaded. A plant's own picture stands beside
+    it.
 
     Args:
         task: The task.
@@ -110,12 +111,18 @@ class Film:
             axis.set_ylim(*ends)
             if truth is not None:
                 lines[3].set_data(np.arange(len(truth)) + 1, truth[:, place])
-        pairs = [(s.outcome.requested[:, run], s.outcome.granted[:, run]) for s in steps]
-        answers = np.array(pairs, dtype=np.bool_).reshape(-1, 2, self.task.sensors)
-        requested, granted = answers.swapaxes(0, 1)
-        for mark, drawn in zip(self._marks, (granted, ~granted), strict=True):
-            places, sensors = np.nonzero(requested & drawn)
+        packets = np.array([_packets(step, run) for step in steps], dtype=np.int64)
+        *drawn, late = packets.reshape(-1, 4, self.task.sensors).swapaxes(0, 1)
+        for mark, marked in zip(self._marks, drawn, strict=False):
+            places, sensors = np.nonzero(marked)
             mark.set_data(times[places], sensors)
+        if self._late is not None:
+            places, sensors = np.nonzero(late)
+            sent, arrival = times[places], times[places] + late[places, sensors]
+            gap = np.full(len(sent), np.nan)  # between two packets
+            across = sent, np.where(arrival <= age, arrival, gap), gap
+            down = sensors, sensors - 0.3, gap
+            self._late.set_data(np.stack(across, 1).ravel(), np.stack(down, 1).ravel())
         for place, line in enumerate(self._inputs):
             line.set_data(times, [cast(Array, s.outcome.control)[place, run] for s in steps])
         if self._inputs:
@@ -188,9 +195,16 @@ class Film:
             self._curves.append([truth, mean, band, whole])
         sensors, bucket = self.task.sensors, self.task.network.bucket
         requests = self._axes[len(self._state_names)]
-        (granted,) = requests.plot([], [], "|", color=_GRANTED, ms=9, mew=2, label="granted")
-        (denied,) = requests.plot([], [], "x", color=_DENIED, ms=5, label="denied")
-        self._marks = (granted, denied)
+        channel, late = self.task.network.channel, len(self.task.network.delay) > 1
+        loses = self.task.network.rule.contended or (channel is not None and channel.loses)
+        word = "arrived" if loses or late else "granted"
+        self._marks = requests.plot([], [], "|", color=_GRANTED, ms=9, mew=2, label=word)
+        self._marks += requests.plot([], [], "x", color=_DENIED, ms=5, label="denied")
+        if loses:
+            self._marks += requests.plot([], [], "v", color=_LOST, ms=5, label="lost")
+        self._late: Any = None
+        if late:
+            (self._late,) = requests.plot([], [], ".-", color=_LATE, ms=5, lw=1, label="late")
         requests.set_ylim(sensors - 0.4, -0.6)
         requests.set_yticks(range(sensors) if sensors <= 6 else [0, sensors - 1])
         requests.set_ylabel("sensor")
@@ -217,11 +231,19 @@ class Film:
         self._figure.legend(
             list(handles.values()), list(handles), loc="upper left", ncols=len(handles),
             bbox_to_anchor=(0.09, 1.0 - 37 / height), fontsize=7, frameon=False, borderaxespad=0.0,
-            borderpad=0.2, columnspacing=1.2, handlelength=1.4,
+            borderpad=0.2, columnspacing=1.2 if len(handles) < 8 else 0.6, handlelength=1.4,
         )  # fmt: skip
         self._title = self._figure.text(
             0.1, 1.0 - 4 / height, "", va="top", fontsize=9, parse_math=False
         )
+
+
+def _packets(step: _Step, run: int) -> list[NDArray[Any]]:
+    """Return the requests (sensors,) that arrive at once, are denied, or lost, and late delays."""
+    requested, granted = step.outcome.requested[:, run], step.outcome.granted[:, run]
+    arrived, due = step.outcome.age[:, run] == 0.0, step.state.network.due
+    late = 0 * requested if due is None else due[0, :, run]
+    return [arrived, requested & ~granted, granted & ~arrived & (late == 0), late]
 
 
 def _join(*pictures: Frame) -> Frame:

@@ -77,6 +77,52 @@ def test_a_film_has_axes_for_its_steps_and_panels_for_what_changes() -> None:
     assert unlimited._axes[-1].get_ylabel() == "sensor"
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "granted denied"),
+        ({"channel": "independent", "drop_probability": 0.5}, "arrived denied lost"),
+        ({"delay": 2}, "arrived denied late"),
+        ({"delay": (0, 3), "channel": "gilbert_elliott"}, "arrived denied lost late"),
+        ({"access": "collision"}, "arrived denied lost"),
+    ],
+)
+def test_marks_are_what_the_network_does(options: dict[str, Any], words: str) -> None:
+    """In every picture: requests that are denied, lost or late, and arrivals until then."""
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", horizon=12, token_rate=1.5, **options)
+    batch, film, drawn = EpisodeBatch.seeded(task, 2, 3), Film(task, 2), np.random.default_rng(1)
+    expected: dict[str, set[tuple[int, int]]] = {word: set() for word in words.split()}
+    ends, arrived = {}, set()
+    for step in range(1, 13):
+        draws, request = batch.state.network.draws, drawn.random((2, 2)) < 0.7
+        outcome = batch.step(request)
+        film.record(batch, outcome)
+        for sensor in np.flatnonzero(request[:, 1]).tolist():
+            delay = options.get("delay", 0) if draws.delay is None else draws.delay[sensor, 1]
+            lost = draws.lost is not None and draws.lost[sensor, 1]
+            lost |= options.get("access") == "collision" and outcome.granted[:, 1].all()
+            word = "lost" if lost else "late" if delay else words.split()[0]
+            word = word if outcome.granted[sensor, 1] else "denied"
+            expected[word].add((step, sensor))
+            if word == "late":
+                ends[step, sensor] = step + delay
+        arrived |= {(step, sensor) for sensor in np.flatnonzero(outcome.arrived[:, 1]).tolist()}
+        film.frame(1)
+        lines = {line.get_label(): line.get_xydata() for line in film._axes[2].get_lines()}
+        assert lines.keys() == expected.keys()
+        late = lines.get("late", np.zeros((0, 2))).reshape(-1, 3, 2)
+        lines |= {"late": late[:, 0]} if "late" in lines else {}
+        assert {word: {*map(tuple, own.tolist())} for word, own in lines.items()} == expected
+        assert np.isnan(late[:, 2]).all()  # no line from an arrival to the next packet
+        for (sent, sensor), (end, row) in late[:, :2].tolist():
+            assert row == sensor - 0.3
+            assert end == ends[sent, sensor] if ends[sent, sensor] <= step else np.isnan(end)
+    assert all(expected[word] for word in words.split()[1:])
+    early = expected.get("arrived", expected.get("granted", set()))
+    assert arrived == early | {(end - 1, own) for (_, own), end in ends.items() if end <= 13}
+    assert film._figure.legends[0].get_texts()[0].get_text() == words.split()[0]
+
+
 def test_both_policies_meet_the_same_noise() -> None:
     """The same rule under two names: both halves alike, below the names."""
     task = fusion_gym.make_task(TOBIT, horizon=4)
