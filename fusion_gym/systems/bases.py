@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import Estimator, StateT
-from fusion_gym.core.knowledge import Block, log_deviation
+from fusion_gym.core.knowledge import Block, Signal, log_deviation
 from fusion_gym.core.plant import Plant
 from fusion_gym.namespace import namespace
 
 RANGE = 5.0  # whitened quantities and logarithms of ratios are clipped here
+SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a reading")
 
 
 @dataclass(slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,14 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.control import Controller
 from fusion_gym.core.estimator import Reception, SignalValues
-from fusion_gym.core.knowledge import Block, age_block, common_signals, log_deviation, numbered
+from fusion_gym.core.knowledge import (
+    Block,
+    Signal,
+    age_block,
+    common_signals,
+    log_deviation,
+    numbered,
+)
 from fusion_gym.errors import ConfigurationError
 from fusion_gym.systems import bases
 
@@ -27,13 +34,15 @@ _SEED = 20_240_229  # of their noise
 class FilteredEstimate(bases.Deliveries):
     """The estimate of N runs at one time; n states.
 
-    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the posterior.
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N) · ``mean``, ``covariance``, the posterior
+    · ``sampled`` (l, N) bool, the sensors with a reading; ``None`` is all.
     """
 
     prior_mean: Array
     prior_covariance: Array
     mean: Array
     covariance: Array
+    sampled: NDArray[np.bool_] | None = None
 
 
 class NonlinearSystem(ABC):
@@ -43,6 +52,9 @@ class NonlinearSystem(ABC):
     The centre processes deliveries in the order of the sensors. The class derives signals,
     observation and the simulated error without transmissions. All arrays have the batch axis N
     last.
+
+    Override :meth:`available` for sensors that have no reading at some steps. Such a sensor cannot
+    request, its innovation is zero, and the filter does not use its measurement.
 
     With ``inputs`` a controller closes the loop: you also write :meth:`control` and :meth:`cost`,
     and :meth:`move` and :meth:`predict` take the input as a last argument ``control`` (k, N). Pass
@@ -141,6 +153,17 @@ class NonlinearSystem(ABC):
             measurement: its measurement (m, N).
         """
 
+    def available(self, state: Array, noise: Array) -> NDArray[np.bool_]:
+        """Return the sensors (l, N), bool, with a reading at this step, by default all.
+
+        At time 0 every sensor has a reading.
+
+        Args:
+            state: true state (n, N), which is measured.
+            noise: standard normals (l, N) of the sensors' own dropouts.
+        """
+        return np.ones(noise.shape, dtype=np.bool_)
+
     def control(self, mean: Array) -> Array:
         """Return the input (k, N); only with ``inputs``.
 
@@ -186,6 +209,12 @@ class NonlinearSystem(ABC):
     def estimator(self) -> NonlinearEstimator:
         """The filter at the centre, for a scenario."""
         return NonlinearEstimator(self)
+
+    @property
+    def dropout_channels(self) -> int:
+        """Number of standard normals that :meth:`available` takes; 0 if it is not overridden."""
+        overridden = type(self).available is not NonlinearSystem.available
+        return self.sensors * overridden
 
     def measured(self, state: Array, noise: Array) -> Array:
         """Return checked measurements (l, m, N) from normals (l * m, N)."""
@@ -249,7 +278,7 @@ class NonlinearController(Controller):
         return self.system.terminated(state.truth)
 
 
-def _checked(name: str, values: Array, shape: tuple[int, ...]) -> Array:
+def _checked(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return what a user's method returned, of this shape."""
     result = np.asarray(values, dtype=np.float64)
     if result.shape != shape:
@@ -270,8 +299,9 @@ class NonlinearPlant(bases.NormalPlant):
 
     @property
     def noise_channels(self) -> int:
-        """Normals of one step: plant, then sensors."""
-        return self.system.process_channels + self.system.sensors * self.system.channels
+        """Normals of one step: plant, then sensors, then their dropouts."""
+        own, system = self.system.sensors * self.system.channels, self.system
+        return system.process_channels + own + system.dropout_channels
 
     @property
     def start_channels(self) -> int:
@@ -287,7 +317,7 @@ class NonlinearPlant(bases.NormalPlant):
         return bases.Truth(truth, system.measured(truth, noise[size:]), None, time), None
 
     def sense(self, state: bases.Truth, noise: Array, *control: Array) -> bases.Truth:
-        """Move the plant, and measure; a run that has ended rests."""
+        """Move the plant, and measure; a run that has ended rests. NaN is no reading."""
         own, over = self.system.process_channels, self._over(state)
         if bool(control) != bool(self.system.inputs):
             system = type(self.system).__name__
@@ -297,14 +327,20 @@ class NonlinearPlant(bases.NormalPlant):
             )
         truth = self.system.move(state.truth, noise[:own], *control)
         truth = truth if over is None else np.where(over, state.truth, truth)
-        return bases.Truth(truth, self.system.measured(truth, noise[own:]), None, state.time + 1.0)
+        last = self.noise_channels - self.system.dropout_channels
+        measurement, rest = self.system.measured(truth, noise[own:last]), noise[last:]
+        if self.system.dropout_channels:
+            present = _checked("available", self.system.available(truth, rest), rest.shape)
+            measurement = np.where(present[:, None], measurement, np.nan)
+        return bases.Truth(truth, measurement, None, state.time + 1.0)
 
     def available(self, state: bases.Truth) -> tuple[NDArray[Any], NDArray[Any]] | None:
         """See :class:`Plant`; a run that has ended has no readings."""
-        over = self._over(state)
-        if over is None:
+        over, present = self._over(state), ~np.isnan(state.measurement[:, 0])
+        if over is None and not self.system.dropout_channels:
             return None
-        return np.tile(~over, (self.sensor_count, 1)), np.ones(state.truth.shape, dtype=np.bool_)
+        present = present if over is None else present & ~over
+        return present, np.ones(state.truth.shape, dtype=np.bool_)
 
     def _over(self, state: bases.Truth) -> NDArray[np.bool_] | None:
         """Return the runs (N,) that have ended."""
@@ -319,10 +355,13 @@ class NonlinearPlant(bases.NormalPlant):
 class NonlinearEstimator(bases.AdoptingEstimator[FilteredEstimate]):
     """The filter of a :class:`NonlinearSystem`, at the centre."""
 
-    signals = common_signals()
-
     def __init__(self, system: NonlinearSystem) -> None:
         self.system = system
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:  # type: ignore[override]
+        """See :class:`Estimator`."""
+        return common_signals() + (bases.SAMPLED,) * bool(self.system.dropout_channels)
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -361,9 +400,19 @@ class NonlinearEstimator(bases.AdoptingEstimator[FilteredEstimate]):
         mean, covariance = self.system.predict(state.mean, state.covariance, *control)
         return state.later(prior_mean=mean, prior_covariance=linalg.symmetrise(covariance))
 
+    def observe(self, state: FilteredEstimate, measurement: Array) -> FilteredEstimate:
+        """See :class:`Estimator`; a sensor without a reading has the expectation."""
+        if not self.system.dropout_channels:
+            return super().observe(state, measurement)
+        sampled = ~np.isnan(measurement[:, 0])
+        measurement = np.where(sampled[:, None], measurement, self._expected(state))
+        return replace(state, measurement=measurement, sampled=sampled)
+
     def update(self, state: FilteredEstimate, reception: Reception) -> FilteredEstimate:
         """Update the centre with the measurements that arrive, sensor by sensor."""
         mean, covariance, arrived = state.prior_mean, state.prior_covariance, reception.arrived
+        if state.sampled is not None:
+            arrived = arrived & state.sampled
         for sensor in np.flatnonzero(arrived.any(1)).tolist():
             first, other = self.system.update(mean, covariance, sensor, state.measurement[sensor])
             mean = np.where(arrived[sensor], first, mean)
@@ -404,4 +453,5 @@ class NonlinearEstimator(bases.AdoptingEstimator[FilteredEstimate]):
             linalg.trace(self.system.update(mean, covariance, sensor, expected[sensor])[1])
             for sensor in range(self.system.sensors)
         ]
-        return linalg.trace(covariance) - np.array(single)
+        sampled: Any = True if state.sampled is None else state.sampled
+        return np.where(sampled, linalg.trace(covariance) - np.array(single), 0.0)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from own_system import OWN_ID
+from own_system import OWN_IDS
 
 import fusion_gym
 from fusion_gym.core.access import AccessOptions
@@ -19,7 +19,7 @@ from fusion_gym.envs.registration import ENVIRONMENTS
 
 Array = NDArray[Any]
 Options = dict[str, Any]
-IDS = [name for name in ENVIRONMENTS if name != OWN_ID] + [OWN_ID]
+IDS = [name for name in ENVIRONMENTS if name not in OWN_IDS] + [*OWN_IDS]
 
 SCARCE: Options = {
     "tokens": "limited", "token_rate": 0.5, "token_capacity": 30.0, "initial_tokens": 9.0,
@@ -156,6 +156,7 @@ NETWORKS: dict[str, list[Options]] = {
         {"filter": "local", "memory": True, "budget": "sensor", "delay": 1} | SCARCE,
     ],
     "RecordedFusion": [{"filter": "local", "memory": True, "budget": "sensor"} | SCARCE],
+    "Dropouts": [{"delay": (0, 2), "channel": "independent"}],
     "TobitOscillator": [
         {"access": "slots", "slots": 2, "channel": "gilbert_elliott"} | SCARCE,
         {"channel": "independent", "true_drop_probability": (0.2, 0.6), "memory": True}

@@ -1,4 +1,4 @@
-"""The user's environment is registered while this folder's tests run, and no longer."""
+"""The users' environments are registered while this folder's tests run, and no longer."""
 
 from collections.abc import Iterator
 
@@ -23,8 +23,10 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def users_environment() -> Iterator[None]:
-    """``mine/RandomWalk-v0`` through the public door."""
-    fusion_gym.register(own_system.OWN_ID, own_system.build)
+def users_environments() -> Iterator[None]:
+    """They come through the public door."""
+    for env_id, build in own_system.OWN_IDS.items():
+        fusion_gym.register(env_id, build)
     yield
-    del ENVIRONMENTS[own_system.OWN_ID], gymnasium.registry[own_system.OWN_ID]
+    for env_id in own_system.OWN_IDS:
+        del ENVIRONMENTS[env_id], gymnasium.registry[env_id]

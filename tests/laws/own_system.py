@@ -1,11 +1,20 @@
-"""An environment as a user would write one: a random walk, seen through noise by one sensor."""
+"""Environments as users would write them: a walk seen by one sensor, and sensors that drop out."""
 
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from fusion_gym import Block, CommonOptions, Estimator, Plant, Reception, Scenario, Signal
+from fusion_gym import (
+    Block,
+    CommonOptions,
+    Estimator,
+    NonlinearSystem,
+    Plant,
+    Reception,
+    Scenario,
+    Signal,
+)
 from fusion_gym.arrays import Array
 from fusion_gym.core.estimator import SignalValues
 from fusion_gym.core.knowledge import age_block
@@ -140,3 +149,45 @@ class WalkOptions(CommonOptions):
 def build(options: WalkOptions) -> Scenario:
     """The scenario of these options."""
     return Scenario(options, RandomWalk(options.q, options.r), WalkFilter(options.q, options.r))
+
+
+class Dropouts(NonlinearSystem):
+    """x' = 0.9 x + w, y = x + v of two sensors, without readings at random and at large x."""
+
+    def __init__(self) -> None:
+        start: Any = {"initial_mean": [0.0], "initial_covariance": [[1.0]]}
+        super().__init__(("x",), sensors=2, process_channels=1, **start)
+
+    def move(self, state: Array, noise: Array) -> Array:
+        return 0.9 * state + 0.5 * noise
+
+    def measure(self, state: Array, noise: Array) -> Array:
+        return state[None] + 0.7 * noise
+
+    def available(self, state: Array, noise: Array) -> Any:
+        return (noise < 0.5) & (np.abs(state) < 1.5)
+
+    def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        return 0.9 * mean, 0.81 * covariance + 0.25
+
+    def update(
+        self, mean: Array, covariance: Array, sensor: int, measurement: Array
+    ) -> tuple[Array, Array]:
+        gain = covariance[0] / (covariance[0] + 0.49)
+        return mean + gain * (measurement - mean), (1.0 - gain) * covariance
+
+
+@dataclass(frozen=True)
+class DropoutOptions(CommonOptions):
+    """Every option of the sensors that drop out."""
+
+    horizon: int = 40
+
+
+def build_dropouts(options: DropoutOptions) -> Scenario:
+    """The scenario of these options."""
+    system = Dropouts()
+    return Scenario(options, system.plant, system.estimator)
+
+
+OWN_IDS = {OWN_ID: build, "mine/Dropouts-v0": build_dropouts}

@@ -146,8 +146,9 @@ def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
     task, view = batch.task, SensorView(batch.task) if case.local_memory else None
     channels = np.arange(task.plant.noise_channels)
     reached = np.zeros((task.sensors, len(channels)), dtype=np.bool_)
-    for signals, _ in steps(batch, np.append(-1, channels), np.zeros((STEPS, task.sensors, 1))):
+    for signals, runs in steps(batch, np.append(-1, channels), np.zeros((STEPS, task.sensors, 1))):
         reached |= differs(signals["measurement"], 0)[:, 1:]
+        reached &= ~differs(runs.admitted(), 0)[:, 1:].any(0)  # who has a reading is no secret
     groups: list[tuple[int, int, int]] = []  # sensor, first run of its group, changed normal
     for sensor, single in enumerate(reached & (reached.sum(0) == 1)):
         first = len(groups)

@@ -19,7 +19,7 @@ from paths import ROOT
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.task import CommonOptions, Scenario
+from fusion_gym.core.task import CommonOptions, Scenario, Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
@@ -142,9 +142,62 @@ def test_what_does_not_fit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         Shaped(initial_covariance=-np.eye(2))
     with pytest.raises(ConfigurationError, match="sensors = 0"):
         Shaped(sensors=0)
+    narrow: Any = type("Narrow", (Linear,), {"available": lambda self, state, noise: noise[0] < 0})
+    with pytest.raises(ValueError, match=r"available of shape \(1000,\) .* it must be \(2, 1000\)"):
+        narrow().plant.open_loop(2)
     monkeypatch.setitem(ENVIRONMENTS, "me/Flat-v0", build_flat)
     with pytest.raises(ValueError, match="measure of shape"):
         fusion_gym.make_task("me/Flat-v0")
+
+
+class Dropping(Linear):
+    """Readings at random, and none of the second sensor where the first state is positive."""
+
+    def available(self, state: Array, noise: Array) -> NDArray[np.bool_]:
+        return (noise < 0.8) & (np.array([[-np.inf], [0.0]]) < -state[0])
+
+
+def kalman(mean: Array, covariance: Array, measured: Array, arrived: Array) -> tuple[Array, Array]:
+    """One step of a Kalman filter with the packets that arrive, in one update."""
+    mean, covariance = A @ mean, A @ covariance @ A.T + W
+    rows, noise = C[arrived], np.diag(DEVIATION[arrived] ** 2)
+    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + noise)
+    return mean + gain @ (measured[arrived] - rows @ mean), covariance - gain @ rows @ covariance
+
+
+def test_a_sensor_without_a_reading_neither_requests_nor_counts() -> None:
+    """Whatever is requested, also in a memory of all readings; everything from the normals."""
+    system, request = Dropping(), np.random.default_rng(0).random((40, 2, 1)) < 0.7
+    options = CommonOptions(memory=True, tokens="unlimited", reward_scale=1.0)
+    task = Task.create(Scenario(options, system.plant, system.estimator))
+    batch = EpisodeBatch.seeded(task, 1, 5)
+    truth = Parts.of(task).truth(batch.state)[:, 0]
+    sent = every = MEAN, START
+    missing = np.zeros(2)
+    for step, requests in enumerate(request):
+        normals = batch.normals()[:, 0]
+        truth = A @ truth + np.sqrt(W) @ normals[:2] if step else truth
+        measured = C @ truth + DEVIATION * normals[2:4]
+        present = (normals[4:] < 0.8) & ((truth[0] < 0.0) | np.array([True, False]))
+        missing += ~present
+        signals = batch.signals()
+        np.testing.assert_array_equal(signals["sampled"][:, 0], present)
+        np.testing.assert_array_equal(signals["admitted"][:, 0], present)
+        assert not signals["innovation"][~present].any()
+        assert not signals["variance_reduction"][~present].any()
+        np.testing.assert_allclose(signals["measurement"][present, 0, 0], measured[present])
+        every = kalman(*every, measured, present)
+        best = batch.beliefs().best
+        np.testing.assert_allclose(best.mean[0, :, 0], every[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(best.covariance[0, ..., 0], every[1], rtol=0, atol=1e-12)
+        outcome = batch.step(requests)
+        np.testing.assert_array_equal(outcome.granted[:, 0], requests[:, 0] & present)
+        sent = kalman(*sent, measured, requests[:, 0] & present)
+        mean, covariance = Parts.of(task).fused(batch.delivered)
+        np.testing.assert_allclose(mean[:, 0], sent[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(covariance[..., 0], sent[1], rtol=0, atol=1e-12)
+    assert (missing > 3).all()
+    assert Linear().plant.noise_channels + 2 == system.plant.noise_channels
 
 
 class Shaped(Linear):

@@ -183,7 +183,6 @@ SIGNALS = (
     Signal("censored", "own", _COMPONENTS, "whether the component is at its threshold"),
     Signal("uncensored_probability", "centre", _COMPONENTS, "predicted P(uncensored)", "own"),
 )
-_SAMPLED = Signal("sampled", "own", "(sensors, N)", "whether the sensor has a reading")
 
 
 @dataclass(frozen=True)
@@ -211,7 +210,7 @@ class CensoredEstimator(
     @property
     def signals(self) -> tuple[Signal, ...]:  # type: ignore[override]
         """See :class:`Estimator`."""
-        return SIGNALS if self.level is None else (*SIGNALS, _SAMPLED)
+        return SIGNALS if self.level is None else (*SIGNALS, bases.SAMPLED)
 
     @property
     def traceable(self) -> bool:  # type: ignore[override]
