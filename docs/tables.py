@@ -98,20 +98,37 @@ def network_table(text: str) -> str:
     rows = []
     for options in " ".join(text.split()).split("; "):
         cells = [
-            "".join(letter for letter in _INTERFACES if _runs(letter, f"{env_id} {options}")) or "–"
+            "".join(
+                k for k, own in _INTERFACES.items() if _runs(f"{env_id} {options}", *own, k == "J")
+            )
+            or "–"
             for env_id in ids
         ]
         rows.append((f"`{options}`", *cells))
     return table(("options", *ids.values()), rows)
 
 
-def _runs(letter: str, text: str) -> bool:
-    more, policy = _INTERFACES[letter]
+def rule_table(text: str) -> str:
+    """Return which rules run with sets of options in one of some environments at least.
+
+    Args:
+        text: ``ID ID …; name=value …; …``; in an option RULE is the rule's name.
+    """
+    ids, *columns = " ".join(text.split()).split("; ")
+    rows = []
+    for rule in registry.policy_names("rule"):
+        own = [options.replace("RULE", rule) for options in columns]
+        runs = [any(_runs(env_id, more, rule) for env_id in ids.split()) for more in own]
+        rows.append((f"`{rule}`", *("✓" if each else "–" for each in runs)))
+    return table(("rule", *(f"`{options}`" for options in columns)), rows)
+
+
+def _runs(text: str, more: str, policy: str, compiled: bool = False) -> bool:
     try:
         with warnings.catch_warnings(action="ignore"):
-            task = task_of(f"{text} {more}".strip())
+            task = task_of(f"{text} {more}")
             registry.make_policy(policy, task)
-            if letter == "J":
+            if compiled:
                 task.refuse_numpy_only()
     except ConfigurationError:
         return False
@@ -219,7 +236,7 @@ TABLES = {
     "filters": filter_table, "fusion": fusion_table, "metrics": metric_table, "names": name_table,
     "networks": network_table,
     "observation": observation_table, "options": option_table, "policies": policy_table,
-    "returns": return_table, "shares": share_table,
+    "returns": return_table, "rules": rule_table, "shares": share_table,
 }  # fmt: skip
 PART = re.compile(r"(?ms)^(<!-- table: (\w+)\s([^>]+?)\s-->\n).*?^(<!-- end -->)$")
 
