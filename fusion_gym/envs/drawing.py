@@ -195,7 +195,7 @@ class Film:
             self._curves.append([truth, mean, band, whole])
         sensors, bucket = self.task.sensors, self.task.network.bucket
         requests = self._axes[len(self._state_names)]
-        channel, late = self.task.network.channel, len(self.task.network.delay) > 1
+        channel, late = self.task.network.channel, self.task.delayed
         loses = self.task.network.rule.contended or (channel is not None and channel.loses)
         word = "arrived" if loses or late else "granted"
         self._marks = requests.plot([], [], "|", color=_GRANTED, ms=9, mew=2, label=word)
