@@ -18,6 +18,7 @@ from agents.papers.adaptive_innovation_runs import SENSORS, STEPS, Lane
 from agents.papers.drawing import legend, set_ticks, stack
 from agents.papers.numbers import Number, cite, grid
 from agents.papers.paper import Data, Paper, PaperFigure, Piece, PieceData, Settings
+from agents.papers.whitening import leading_sample
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Signals
 from fusion_gym.docstrings import table
@@ -217,7 +218,7 @@ def _summarise_fusion(data: Data) -> Data:
         "bounded": lanes.means("bounded", every),
         "settings": [name.removeprefix("scale ") for name in every],
         "worst": np.max([lanes.both("worst", lane).max(-1) for lane in every], axis=0),
-        "real": [runs.top(lanes("sici", "whitened", lane)) for lane in (ALWAYS, AT_BOUND)],
+        "real": [leading_sample(lanes("sici", "whitened", lane)) for lane in (ALWAYS, AT_BOUND)],
         "node": lanes("sci", "node_mse", AT_BOUND),
         "node_share": min(float(lanes("sci", "node_bounded", lane).min()) for lane in every),
         "gap": float(lanes("sci", "node_gap", AT_BOUND).max()),

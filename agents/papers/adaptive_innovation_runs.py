@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from agents.papers.paper import Settings
+from agents.papers.whitening import whitened_square
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
@@ -190,8 +191,8 @@ class ErrorRecord:
         self._add(
             mse=mse, actual=traces[0], conservative=traces[1],
             inside=np.abs(error) <= 3.0 * deviation, ordered=deviation <= bound * (1.0 + _ROUNDING),
-            bounded=largest <= 1.0 + _ROUNDING, whitened=_whitened(error, claimed), square=error**2,
-            level=start**2, beats=traces[1] <= linalg.trace(estimate.covariances[1:]),
+            bounded=largest <= 1.0 + _ROUNDING, whitened=whitened_square(error, claimed),
+            square=error**2, level=start**2, beats=traces[1] <= linalg.trace(estimate.covariances[1:]),
         )  # fmt: skip
         self._most(worst=largest)
         for name, value in zip(("mse", "actual", "conservative"), (mse, *traces), strict=True):
@@ -242,16 +243,3 @@ def _largest(actual: Array, claimed: Array) -> Array:
     whitened = factor @ _first(actual) @ factor.swapaxes(-1, -2)
     even = 0.5 * (whitened + whitened.swapaxes(-1, -2))
     return np.asarray(np.linalg.eigvalsh(even)[..., -1], dtype=float)
-
-
-def _whitened(error: Array, claimed: Array) -> Array:
-    """Return L⁻¹ e eᵀ L⁻ᵀ (n, n, N) of errors (n, N), with P = L Lᵀ."""
-    root = np.linalg.cholesky(_first(claimed))
-    z = np.linalg.solve(root, error.T[..., None])[..., 0].T
-    return z[:, None] * z[None]
-
-
-def top(whitened: Array) -> Array:
-    """Return the sample (E,) along the leading eigenvector of the mean of (n, n, E)."""
-    direction = np.linalg.eigh(whitened.mean(-1))[1][:, -1]
-    return np.einsum("i,ijk,j->k", direction, whitened, direction)

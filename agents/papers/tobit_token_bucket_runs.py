@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from agents.papers.walk import walk
+from agents.papers.whitening import leading_sample, whitened_square
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -244,13 +245,8 @@ def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
 
     It is at most 1 if the bound holds on average. ``error`` (H, n, E), ``bound`` (H, n, n, E).
     """
-    root = np.moveaxis(linalg.root(bound), -1, 1)
-    turned = np.moveaxis(error, 1, -1)[..., None]
-    whitened = np.linalg.solve(root, turned)[..., 0]
-    second = np.einsum("tei,tej->tij", whitened, whitened) / error.shape[-1]
-    values, vectors = np.linalg.eigh(second)
-    along = np.einsum("tei,ti->te", whitened, vectors[..., -1]) ** 2
-    return values[:, -1], along.std(-1, ddof=1) / np.sqrt(error.shape[-1])
+    sample = leading_sample(whitened_square(error, bound))
+    return sample.mean(-1), sample.std(-1, ddof=1) / np.sqrt(error.shape[-1])
 
 
 def _norm(matrix: Array) -> Array:

@@ -16,6 +16,7 @@ from agents.papers.numbers import estimate, grid
 from agents.papers.paper import Data, Paper, PaperFigure, Piece, Settings
 from agents.papers.unknown_input_claims import claims
 from agents.papers.walk import walk
+from agents.papers.whitening import leading_sample, whitened_square
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.entries import Options
@@ -104,11 +105,7 @@ def leading(errors: Array, bounds: Array) -> Array:
     The bounds whiten the errors, so a bound allows 1; the direction has the largest errors over all
     times and episodes.
     """
-    root = np.linalg.inv(np.linalg.cholesky(np.moveaxis(bounds, -1, 0)))
-    z = root @ errors
-    moment = np.einsum("hie,hje->ije", z, z) / len(z)
-    direction = np.linalg.eigh(moment.mean(-1))[1][:, -1]
-    return np.einsum("i,ije,j->e", direction, moment, direction)
+    return leading_sample(whitened_square(errors, np.moveaxis(bounds, -1, 0)[..., None]).mean(0))
 
 
 # --- the printed example beside two carts ---------------------------------------------------------

@@ -13,7 +13,7 @@ import fusion_gym
 from agents.papers import adaptive_innovation, markov_jump, unknown_input
 from agents.papers import round_robin_tobit_runs as biased
 from agents.papers import tobit_token_bucket_runs as runs
-from agents.papers.adaptive_innovation_runs import Lane, TriggerReading, _largest, _whitened, steps
+from agents.papers.adaptive_innovation_runs import Lane, TriggerReading, _largest, steps
 from agents.papers.claims import DEPENDS, FAILS, HOLDS, UNDECIDED, outcome, verdict
 from agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
 from agents.papers.markov_jump_covariances import covariances, iterated_gap
@@ -28,6 +28,7 @@ from agents.papers.paper import NAMES
 from agents.papers.round_robin_tobit_theorems import MatrixBound, matrix_below
 from agents.papers.unknown_input_recursion import gains, models
 from agents.papers.walk import SomeSensors
+from agents.papers.whitening import whitened_square
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.metrics import Interval
@@ -466,7 +467,7 @@ def test_whitened_errors_sum_to_the_normalised_square() -> None:
     rng = np.random.default_rng(1)
     root, error = rng.normal(size=(3, 3)), rng.normal(size=(3, 1))
     claimed = root @ root.T + np.eye(3)
-    square = _whitened(error, claimed[..., None])
+    square = whitened_square(error, claimed[..., None])
     assert np.trace(square[..., 0]) == pytest.approx(
         float(error[:, 0] @ np.linalg.solve(claimed, error[:, 0]))
     )
