@@ -192,7 +192,8 @@ class ErrorRecord:
             mse=mse, actual=traces[0], conservative=traces[1],
             inside=np.abs(error) <= 3.0 * deviation, ordered=deviation <= bound * (1.0 + _ROUNDING),
             bounded=largest <= 1.0 + _ROUNDING, whitened=whitened_square(error, claimed),
-            square=error**2, level=start**2, beats=traces[1] <= linalg.trace(estimate.covariances[1:]),
+            square=error**2, level=start**2,
+            beats=traces[1] <= linalg.trace(estimate.covariances[1:]),
         )  # fmt: skip
         self._most(worst=largest)
         for name, value in zip(("mse", "actual", "conservative"), (mse, *traces), strict=True):
