@@ -262,7 +262,7 @@ def measure_gpu(seconds: float, sizes: Iterable[int] = GPU_RUNS) -> str:
             workload(1e-9)
             slowest = max(slowest, time.perf_counter() - began)
             cells.append(_rounded(np.median([workload(seconds) for _ in range(TURNS)])))
-        lines.append((_label(name, options), *cells, f"{slowest:.0f}"))
+        lines.append((_label(name, options), *cells, f"{slowest:.1f}"))
     heads = "environment", *map(_runs, sizes), "first call (s)"
     device = jax.devices()[0].device_kind
     return f"{table(heads, lines)}\n\n{device}, in fusion-gym {fusion_gym.__version__}."

@@ -61,6 +61,9 @@ def test_drawn_options_give_the_steps_of_numpy(name: str) -> None:
             label = f"{options} in step {step}"
             for field, ours, plain in zip(outcomes[0]._fields, *outcomes[::-1], strict=True):
                 message = f"{field} with {label}"
+                assert (ours is None) == (plain is None), message
+                if plain is None:
+                    continue
                 np.testing.assert_allclose(ours, plain, rtol=1e-8, atol=1e-8, err_msg=message)
             if len(ended := np.flatnonzero(outcomes[0].ended)):
                 for batch in batches:
