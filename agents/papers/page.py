@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jinja2
 import matplotlib.pyplot as plt
+from PIL import Image
 
 from agents.papers import numbers
 from agents.papers.claims import Judgement
@@ -16,6 +17,7 @@ from fusion_gym.entries import Plain
 from fusion_gym.output import palette
 from fusion_gym.output.files import read_json, replacing, write, write_text
 
+_COLOURS = 64  # of a PNG, a third of the bytes of all
 _MADE = "({episodes:,} episodes, the first with seed {seed}.)"
 TEMPLATES = Path(__file__).parent
 Counts = Mapping[str, Mapping[str, int]]  # episodes and seed of each piece
@@ -110,7 +112,10 @@ def write_page(paper: Paper, results: Results, counts: Counts, output: Path) -> 
         path = output / paper.name / f"{name}.png"
         with plt.rc_context(palette.READABLE), replacing(path) as partial:
             drawing = figure.draw_data(results[next(iter(paper.readings))][figure.piece])
-            drawing.savefig(partial, format="png", metadata={"Software": None})
+            drawing.savefig(partial, format="png")
+            with Image.open(partial) as picture:
+                reduced = picture.convert("RGB").quantize(_COLOURS)
+            reduced.save(partial, "PNG", optimize=True)
     write_text(output / f"{paper.name}.md", text)
     write(output / f"{paper.name}.json", content)
     return content

@@ -42,7 +42,7 @@ class ChannelOptions(OptionGroup):
     drop_probability: Annotated[ArrayLike | None, Scaling()] = None
     """Probability of a loss. Independent: one number, or one per sensor, by default 0.2; with
     ``access="assignment"`` also a matrix (sensors, channels). Gilbert-Elliott: the pair (bad,
-    good), or a row of it per sensor, by default (0.7, 0.2)."""
+    good), or without an assignment a row of it per sensor, by default (0.7, 0.2)."""
     channel_transition: Annotated[ArrayLike | None, Scaling()] = None
     """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel:
     a matrix, or one per sensor. By default ((0.7, 0.3), (0.1, 0.9))."""
@@ -124,8 +124,8 @@ class Channel:
             drop = validation.by_row(drop, shape) if self.channels else drop
             return _probabilities("drop_probability", drop, shape).reshape(1, -1)
         own = validation.array_shape(drop)
-        if own not in ((2,), (self.sensors, 2)):
-            allowed = "a pair of probabilities (bad, good), or a row of it per sensor"
+        if own != (2,) and (own != (self.sensors, 2) or self.channels):  # a column is a channel's
+            allowed = "a pair of probabilities (bad, good), or without an assignment one per sensor"
             raise validation.refusal("drop_probability", drop, allowed)
         return self._by_link(_probabilities("drop_probability", drop, own), (2,)).T
 

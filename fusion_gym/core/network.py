@@ -239,7 +239,7 @@ class Network:
         return self.delay.shape[1] - 1
 
     @cached_property
-    def _longer(self) -> Array:
+    def _delay_quantiles(self) -> Array:
         """Uniform numbers (D, l, 1) from which on a delay is longer than 0, …, D - 1 steps."""
         possible = self.delay[:, :0:-1].cumsum(1)[:, ::-1] > 0.0
         return np.where(possible, self.delay.cumsum(1)[:, :-1], 2.0).T[..., None]
@@ -305,7 +305,7 @@ class Network:
             present = nothing if draws.following is None else draws.following
             draws.lost = self.channel.lost(present, own["lost"], state.true_drop)
         if "delay" in own:
-            draws.delay = (ndtr(own["delay"]) >= self._longer).sum(0)
+            draws.delay = (ndtr(own["delay"]) >= self._delay_quantiles).sum(0)
         if "unreported" in own:
             draws.unreported = ndtr(own["unreported"]) >= self.acknowledgement
         if "frequency" in own:

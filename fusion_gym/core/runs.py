@@ -314,7 +314,7 @@ class Runs:
         return self.admitted() & self.task.network.bucket.affordable(self.state.network.tokens)
 
     def read(self, local: bool = False, late: bool = False) -> dict[str, Any]:
-        """Return the estimator's signals, with the network's probability of an arrival."""
+        """Return the estimator's signals, with the probability of an arrival, now or also late."""
         arrival = self.arrival_probability(late)
         failure = None if arrival is None else 1.0 - arrival
         values = dict(self.task.estimator.read(self.known_to(local), failure))

@@ -159,6 +159,7 @@ OPTIONS: list[tuple[Any, ...]] = [
     (CORRELATED, {"action": "assignment"}, "action = 'assignment'", "access='any'"),
     (CORRELATED, QUALITIES | PAIRS | {"channels": 3, "channel": "independent"}, "shape (3, 3)"),
     (CORRELATED, QUALITIES | {"channel": "independent"}, "shape (3,)"),
+    (CORRELATED, QUALITIES | PAIRS | GILBERT_ELLIOTT, "a pair of probabilities"),
     (CORRELATED, {"drop_probability": (0.3, 0.2, 0.1)} | GILBERT_ELLIOTT, "a pair of"),
     (TOBIT, {"own_number": 1}, "own_number = 1 "),
 ]

@@ -27,9 +27,7 @@ def verdicts(claims: Claims, runs: Runs) -> dict[str, str]:
     return {claim.text: claim.judge({"": data}).verdict for claim in claims}
 
 
-def check(
-    claims: Claims, runs: Runs, changes: Mapping[str, Change | tuple[Change, Change]]
-) -> None:
+def check(claims: Claims, runs: Runs, changes: Mapping[str, Change | Pair]) -> None:
     """Assert that each claim holds on the runs, and fails where its change is made.
 
     Of a pair the first change makes the claim hold, where claims exclude each other.

@@ -21,7 +21,7 @@ PAGES = ROOT / "docs" / "reproduction"
 ERRORS = 4.5  # of both samples together
 SLACK = 1e-9  # what else a number may be off, relative to its size (or absolute below 1)
 SEED = 1_000_000
-MOST = 250_000  # bytes of a figure
+MOST = 100_000  # bytes of a figure
 
 
 def quick(paper: Paper, episodes: int) -> tuple[dict[str, Any], dict[str, Data]]:
