@@ -66,7 +66,16 @@ def total(a: FloatArray, axis: int = -2) -> FloatArray:
 
 
 def trace(a: FloatArray) -> FloatArray:
-    """Return the trace ``(..., N)`` of ``(..., n, n, N)``."""
+    """Return the trace ``(..., N)``.
+
+    Args:
+        a: ``(..., n, n, N)``.
+
+    Example:
+        >>> from fusion_gym import linalg
+        >>> linalg.trace(linalg.identity(3)).tolist()
+        [3.0]
+    """
     total = a[..., 0, 0, :].copy()
     for k in range(1, a.shape[-2]):
         total += a[..., k, k, :]
@@ -84,7 +93,18 @@ def weighted_trace(a: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
-    """Return ``a + diag(d)`` of ``(..., n, n, N)`` and d broadcastable to ``(..., n, N)``."""
+    """Return ``a + diag(d)``.
+
+    Args:
+        a: ``(..., n, n, N)``.
+        d: broadcastable to ``(..., n, N)``.
+
+    Example:
+        >>> import numpy as np
+        >>> from fusion_gym import linalg
+        >>> linalg.add_diagonal(linalg.identity(2), np.array([[1.0], [2.0]]))[..., 0].tolist()
+        [[2.0, 0.0], [0.0, 3.0]]
+    """
     result = a.copy()
     for k in range(a.shape[-2]):
         result = update_at(np.add, result, (..., k, k, _ALL), d[..., k, :])
@@ -156,7 +176,22 @@ def _inverse_of_stack(stack: FloatArray) -> FloatArray:
 
 
 def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the product ``a v``, ``(..., n, N)``, of ``(..., n, k, N)`` and ``(..., k, N)``."""
+    """Return the product ``a v``, ``(..., n, N)``.
+
+    Args:
+        a: ``(..., n, k, N)``.
+        v: ``(..., k, N)``.
+
+    Raises:
+        ValueError: The two axes of length k differ.
+
+    Example:
+        >>> import numpy as np
+        >>> from fusion_gym import linalg
+        >>> rotation = np.array([[0.0, -1.0], [1.0, 0.0]])[..., None]
+        >>> linalg.matvec(rotation, np.array([[2.0], [3.0]]))[:, 0].tolist()
+        [-3.0, 2.0]
+    """
     length = a.shape[-2]
     _require_equal_lengths("matvec", length, v.shape[-2])
     if min(a.shape[-3], length) >= _LARGE and namespace(a, v) is np:
@@ -168,12 +203,39 @@ def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def outer(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return ``u v^T``, ``(..., n, m, N)``, of ``(..., n, N)`` and ``(..., m, N)``."""
+    """Return ``u v^T``, ``(..., n, m, N)``.
+
+    Args:
+        u: ``(..., n, N)``.
+        v: ``(..., m, N)``.
+
+    Example:
+        >>> import numpy as np
+        >>> from fusion_gym import linalg
+        >>> u = np.array([[1.0], [2.0]])
+        >>> linalg.outer(u, u)[..., 0].tolist()
+        [[1.0, 2.0], [2.0, 4.0]]
+    """
     return u[..., :, None, :] * v[..., None, :, :]
 
 
 def dot(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the inner product ``u^T v``, ``(..., N)``, of two vectors ``(..., n, N)``."""
+    """Return the inner product ``u^T v``, ``(..., N)``.
+
+    Args:
+        u: ``(..., n, N)``.
+        v: ``(..., n, N)``.
+
+    Raises:
+        ValueError: The two axes of length n differ.
+
+    Example:
+        >>> import numpy as np
+        >>> from fusion_gym import linalg
+        >>> u = np.array([[1.0], [2.0]])
+        >>> linalg.dot(u, u).tolist()
+        [5.0]
+    """
     _require_equal_lengths("dot", u.shape[-2], v.shape[-2])
     return total(u * v)
 
@@ -201,6 +263,13 @@ def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
 
     Raises:
         ValueError: The sizes of `a` and `p` differ.
+
+    Example:
+        >>> import numpy as np
+        >>> from fusion_gym import linalg
+        >>> motion = np.array([[1.0, 2.0], [0.0, 1.0]])[..., None]
+        >>> linalg.congruence(motion, linalg.identity(2))[..., 0].tolist()
+        [[5.0, 2.0], [2.0, 1.0]]
     """
     product = matmul(matmul(a, p), a.swapaxes(-3, -2))
     return product if product.shape[-2] == 1 else symmetrise(product)

@@ -105,7 +105,23 @@ def number(
     at_least: float | None = None,
     at_most: float | None = None,
 ) -> float:
-    """Return a finite real number within the limits."""
+    """Return a finite real number within the limits.
+
+    Args:
+        field: name of the field in the error.
+        value: the value.
+        above: exclusive lower limit; None for none.
+        at_least: lower limit; None for none.
+        at_most: upper limit; None for none.
+
+    Raises:
+        ConfigurationError: the value is no such number.
+
+    Example:
+        >>> from fusion_gym import validation
+        >>> validation.number("threshold", 2, at_least=0.0)
+        2.0
+    """
     limits = (">", operator.gt, above), (">=", operator.ge, at_least), ("<=", operator.le, at_most)
     given = [(sign, within, limit) for sign, within, limit in limits if limit is not None]
     listed = " and ".join(f"{sign} {limit}" for sign, _, limit in given)

@@ -50,6 +50,13 @@ def age_sources(task: Task, longest: int = _LONGEST) -> tuple[AgeSource, ...]:
 
     Raises:
         ConfigurationError: another plant, or an infinite cost of a source that always transmits.
+
+    Example:
+        >>> from fusion_gym import make_task
+        >>> from fusion_gym.solvers import age_sources
+        >>> options = {"sources": (2, 0), "access": "slots"}
+        >>> len(age_sources(make_task("fusion_gym/RemoteEstimation-v1", **options)))
+        2
     """
     model, network = task.plant, task.network
     if not isinstance(model, AgedSources):
@@ -108,6 +115,14 @@ def solve_ages(sources: tuple[AgeSource, ...], at_most: int | None = None) -> Ag
 
     Raises:
         ConfigurationError: more than 300,000 states or sets of sources, or no convergence.
+
+    Example:
+        >>> from fusion_gym import make_task
+        >>> from fusion_gym.solvers import age_sources, solve_ages
+        >>> options = {"sources": (2, 0), "access": "slots"}
+        >>> task = make_task("fusion_gym/RemoteEstimation-v1", **options)
+        >>> f"{solve_ages(age_sources(task, longest=20), at_most=1).cost:.2f}"
+        '14.85'
     """
     count = len(sources)
     limit = count if at_most is None else validation.integer("at_most", at_most, at_least=1)

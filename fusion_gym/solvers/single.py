@@ -186,6 +186,11 @@ def solve_average(
 
     Raises:
         ConfigurationError: no convergence, for example for an unstable source with frequent losses.
+
+    Example:
+        >>> from fusion_gym.solvers import SourceProblem, solve_average
+        >>> f"{solve_average(SourceProblem.create(price=5.0)).cost:.2f}"
+        '1.54'
     """
     bellman = Bellman(problem, grid or problem.grid())
     bellman.curvature = problem.stationary_curvature()
@@ -347,6 +352,12 @@ def lagrangian_bound(
 
     Raises:
         ConfigurationError: a value that is not allowed.
+
+    Example:
+        >>> from fusion_gym.solvers import SourceProblem, lagrangian_bound
+        >>> bound = lagrangian_bound([SourceProblem.create(price=0.0)], spent=[1.0], rate=0.1)
+        >>> f"{bound.cost:.2f}"
+        '1.37'
     """
     # Imported here, because scipy.optimize takes a tenth of a second to load.
     from scipy.optimize import minimize_scalar

@@ -170,6 +170,11 @@ class SourceProblem:
         drop: probability of a loss in each channel state (S,).
         initial: law of the channel's state at time 0 (S,).
         tokens: levels of the bucket.
+
+    Example:
+        >>> from fusion_gym.solvers import SourceProblem
+        >>> SourceProblem.create(coefficient=0.9, price=5.0).price
+        5.0
     """
 
     coefficient: float

@@ -53,6 +53,12 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
 
     Raises:
         ConfigurationError: another system, a drawn price, or a reward without the squared error.
+
+    Example:
+        >>> from fusion_gym import make_task
+        >>> from fusion_gym.solvers import source_problems
+        >>> len(source_problems(make_task("fusion_gym/RemoteEstimation-v1", sensors=2)))
+        2
     """
     system, channel, reward = _sources(task), task.network.channel, task.reward
     task.refuse_delay("the optimum supposes arrivals in the step of a request")

@@ -89,6 +89,13 @@ def silence_bound(
 
     Raises:
         ConfigurationError: a task without this bound, or a value that is not allowed.
+
+    Example:
+        >>> from fusion_gym import make_task
+        >>> from fusion_gym.solvers.silence import silence_bound
+        >>> task = make_task("fusion_gym/TobitOscillator-v1", filter="tobit", horizon=10)
+        >>> f"{silence_bound(task, rates=[0.1], accuracy=0.2, most_points=20_000).floor:.3f}"
+        '0.053'
     """
     model = silence_model(task, weights)
     required = [validation.number("rates", rate, above=0.0, at_most=1.0) for rate in rates]
