@@ -122,15 +122,16 @@ papers-check: $(STAMP)  ## the papers' verdicts from a tenth of the episodes, ag
 zoo: $(STAMP)  ## the best learned policies of the benchmark: fusion_gym/zoo/
 	$(BIN)/python -m agents.zoo
 
-lines:  ## code lines without blanks, comments and docstrings
+lines:  ## code lines without blanks, comments and docstrings, and words of prose
 	@$(PYTHON) tests/repository/lines.py
+	@$(PYTHON) tests/repository/prose.py
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(STAMP)  ## let ruff mend what it can
+format: $(STAMP)  ## let ruff fix what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
@@ -143,9 +144,8 @@ pages: $(STAMP)  ## tables and the picture of networks in docs/, from the code
 	$(BIN)/python -m docs.tables
 	$(BIN)/python -m docs.protocols
 
-docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links and length of its prose checked
+docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links checked
 	$(BIN)/python -m docs.tables --check
-	$(BIN)/python tests/repository/prose.py
 	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -j 2 -c docs -d runs/docs/doctrees . site/html
 	echo '<meta http-equiv="refresh" content="0; url=html/docs/index.html">' > site/index.html
 

@@ -1,11 +1,12 @@
 """Measure what policies return in every environment with its defaults.
 
-    python -m agents.returns                         # fusion_gym/envs/returns.csv
+    python -m agents.returns
 
-The best threshold and the searched rule are tuned at the environment's price. PPO has the lines of
-README, and the defaults of Stable-Baselines3. Where SAC sets thresholds, it has the processor time
-of README's PPO. Each policy runs the same 1,000 test episodes. Gymnasium's ``reward_threshold`` is
-the return of the better one of both rules. Finished jobs stay in the work folder.
+The table is ``fusion_gym/envs/returns.csv``. The best threshold and the searched rule are tuned at
+the environment's price. PPO has the lines of README, and the defaults of Stable-Baselines3. Where
+SAC sets thresholds, it has the processor time of README's PPO. Each policy runs the same 1,000
+test episodes. Gymnasium's ``reward_threshold`` is the return of the better one of both rules.
+Finished jobs stay in the work folder.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""Compare what practice runs with filters that use silence, at equal rates, for docs/silence.md.
+"""Compare what devices run with filters that use silence, at equal rates, for docs/silence.md.
 
     python -m benchmarks.silence [--episodes 1000] [--resume]
 
@@ -106,7 +106,7 @@ def at_rate(plant: Options, method: Method, shape: Array, rate: float) -> tuple[
 
 
 def tune(plant: Options, method: Method, shape: Array, rate: float) -> Array:
-    """Return one threshold a sensor, each changed by a factor while the error falls."""
+    """Return one threshold per sensor, each changed by a factor while the error falls."""
     best, error = at_rate(plant, method, shape, rate)
     for sensor in range(len(shape)):
         for change in (1.5, 1.0 / 1.5):

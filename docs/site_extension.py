@@ -11,6 +11,9 @@ from sphinx.addnodes import download_reference, pending_xref
 from sphinx.application import Sphinx
 
 _CODE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_PRINTED = re.compile(
+    r"(^```python\n(?:(?!^```).)*^```\n)\n```text\n.*?^```$", re.MULTILINE | re.DOTALL
+)
 _FILE = re.compile(r"^```\w+\n(# (\w+\.(?:py|yaml))\n.*?)^```$", re.MULTILINE | re.DOTALL)
 _LITERAL = re.compile(r"(``.*?``|\$\$.*?\$\$|\$[^$\n]+\$)", re.DOTALL)
 
@@ -18,9 +21,10 @@ _LITERAL = re.compile(r"(``.*?``|\$\$.*?\$\$|\$[^$\n]+\$)", re.DOTALL)
 def read_page(text: str) -> nbformat.NotebookNode:
     """Return a page as a notebook, its blocks of Python as the cells that run.
 
-    A hidden first cell writes the blocks whose first line names a file.
+    What they print replaces the text below them. A hidden first cell writes the blocks whose first
+    line names a file.
     """
-    parts = _CODE.split(text)
+    parts = _CODE.split(_PRINTED.sub(r"\1", text))
     cells = [
         new_code_cell(part.strip(), id=f"cell{place}")
         if place % 2

@@ -9,15 +9,21 @@ import re
 import statistics
 import sys
 import warnings
+from collections import ChainMap
 from pathlib import Path
 from typing import Any, cast
 
-from fusion_gym.core.access import ACCESS
-from fusion_gym.core.knowledge import MEANING
-from fusion_gym.core.task import Task
+from fusion_gym.core.access import ACCESS, AccessOptions
+from fusion_gym.core.action import ActionOptions
+from fusion_gym.core.channel import ChannelOptions
+from fusion_gym.core.knowledge import MEANING, ObservationOptions
+from fusion_gym.core.plant import TruthOptions
+from fusion_gym.core.reward import RewardOptions
+from fusion_gym.core.task import CommunicationOptions, Task
+from fusion_gym.core.token_bucket import BucketOptions
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs import pages
-from fusion_gym.envs.option_text import options_in, short
+from fusion_gym.envs.option_text import FOR_ALL, options_in, short
 from fusion_gym.envs.registration import ENVIRONMENTS, make_task, options_of
 from fusion_gym.envs.returns import returns_of, reward_threshold, share_text
 from fusion_gym.envs.views import make_view
@@ -26,6 +32,8 @@ from fusion_gym.evaluation.metrics import metric_table
 from fusion_gym.fusion.table import RULES
 from fusion_gym.policies import registry
 from fusion_gym.policies.registry import parse_settings
+from fusion_gym.systems.linear_control import ControlOptions
+from fusion_gym.systems.tobit.system import FeedbackOptions
 from fusion_gym.training.config import algorithm_table
 
 # Interfaces by letter: a further option, and a policy that runs there.
@@ -45,7 +53,14 @@ _PAPERS = {
     "unknown_input.md": (5, "unknown_input"),
 }  # by the page of an environment
 _LEGEND = "Only sensors know an entry with a star ([who knows what](concepts.md#who-knows-what))."
-_WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
+# Options that several environments share, by the class that declares them.
+_COMMON = {
+    kind.__name__: {k: v for k, v in options_in(kind).items() if k in kind.__annotations__}
+    for kind in (
+        AccessOptions, BucketOptions, ChannelOptions, CommunicationOptions, ObservationOptions,
+        ActionOptions, RewardOptions, TruthOptions, ControlOptions, FeedbackOptions,
+    )
+} | {"FOR_ALL": FOR_ALL}  # fmt: skip
 
 
 def fact_table(env_id: str) -> str:
@@ -74,22 +89,34 @@ def observation_table(text: str) -> str:
 
 
 def option_table(text: str) -> str:
-    """Return options of one or more environments.
+    """Return the options of a group, or what environments add to the common ones and change.
 
     Args:
-        text: Ids of environments with the same options, and names of options; without a name all.
+        text: A group of ``_COMMON``; or ids of environments with the same options, and after
+            ``beyond`` the id of one whose options they extend.
     """
-    words = text.split()
-    every = [options_in(options_of(word)) for word in words if "/" in word]
-    names = [word for word in words if "/" not in word] or list(every[0])
-    rows = []
-    for name in names:
-        types = (_WORDS.get(part, f"`{part}`") for part in every[0][name].type.split(" | "))
-        defaults = dict.fromkeys(f"`{short(options[name].default)}`" for options in every)
-        cells = " or ".join(types), "; ".join(d if len(d) < 60 else "…" for d in defaults)
-        quoted = (cell.replace("'", '"') for cell in cells)
-        rows.append((f"`{name}`", *quoted, plain_marks(every[0][name].meaning)))
-    return table(("option", "type", "default", "meaning"), rows)
+    ids, _, other = text.partition(" beyond ")
+    every = [_COMMON.get(name) or options_in(options_of(name)) for name in ids.split()]
+    known = [options_in(options_of(other))] if other else []
+    common = ChainMap(*known, *({} if text in _COMMON else _COMMON).values())
+    rows, changed = [], []
+    for name, option in every[0].items():
+        defaults = dict.fromkeys(short(options[name].default) for options in every)
+        if name in common and common[name].meaning == option.meaning:
+            if {*defaults} != {short(common[name].default)}:
+                changed.append(f"`{name}={' or '.join(defaults)}`".replace("'", '"'))
+            continue
+        types = " or ".join(f"`{part}`" for part in option.type.split(" | "))
+        usual = " or ".join(f"`{default}`" if len(default) < 60 else "…" for default in defaults)
+        cells = types.replace("'", '"'), usual.replace("'", '"'), plain_marks(option.meaning)
+        rows.append((f"`{name}`", *cells))
+    result = table(("option", "type", "default", "meaning"), rows)
+    others = ", ".join(changed)
+    return (
+        f"{result}\n\nOther defaults of [common options](options.md): {others}."
+        if others
+        else result
+    )
 
 
 def network_table(text: str) -> str:

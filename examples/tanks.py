@@ -5,7 +5,7 @@
 Two pumps fill four tanks, and five probes hang above one another in each. A probe covers 4 cm of
 the 20 cm and saturates beyond: it says "below me", a level, or "above me". So nearly all of the
 twenty have nothing new to tell at most times, and which ones do moves with the levels. All share
-0.35 packets a step. The options are in ``tanks.yaml``, for
+0.35 packets per step. The options are in ``tanks.yaml``, for
 ``gym.make("fusion_gym/LinearFusion-v2", system="tanks.yaml")``; :func:`options` works them out.
 
 Where the parameters come from:
@@ -81,10 +81,10 @@ def options() -> dict[str, Any]:
 
 
 def main(episodes: int = 1000) -> None:
-    """Print packets a step, mean squared error of the levels and consistency of every rule."""
+    """Print packets per step, mean squared error of the levels and consistency of every rule."""
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", system=str(FILE))
     print(f"{episodes} episodes, seeds 0 to {episodes - 1}; 95 % intervals")
-    print(f"{'rule':30s}{'packets a step':>15s}   {'MSE of four levels, cm²':26s}{'NEES':>6s}")
+    print(f"{'rule':30s}{'packets per step':>15s}   {'MSE of four levels, cm²':26s}{'NEES':>6s}")
     for label, name in RULES.items():
         results = run_episodes(task, fusion_gym.make_policy(name, task), episodes, seed=0)
         mean, low, high = mean_interval(results.mse)

@@ -46,10 +46,10 @@ RULES = {
 
 
 def main(episodes: int = 1000) -> None:
-    """Print tokens a step, mean squared error of the position and consistency of every rule."""
+    """Print tokens per step, mean squared error of the position and consistency of every rule."""
     task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", system=str(FILE))
     print(f"{episodes} episodes, seeds 0 to {episodes - 1}; 95 % intervals")
-    print(f"{'rule':36s}{'packets a step':>15s}   {'MSE of the position, m²':26s}{'NEES':>6s}")
+    print(f"{'rule':36s}{'packets per step':>15s}   {'MSE of the position, m²':26s}{'NEES':>6s}")
     for label, name in RULES.items():
         results = run_episodes(task, fusion_gym.make_policy(name, task), episodes, seed=0)
         mean, low, high = mean_interval(-results.returns / task.horizon)

@@ -14,7 +14,7 @@ from fusion_gym.validation import ConfigurationError
 from fusion_gym.version import __version__
 
 if TYPE_CHECKING:
-    from fusion_gym import evaluation, jax, wrappers, zoo
+    from fusion_gym import evaluation, wrappers, zoo
     from fusion_gym.core.control import Controller
     from fusion_gym.core.estimator import Estimator, Reception
     from fusion_gym.core.knowledge import Block, Signal, age_block
@@ -52,7 +52,6 @@ __all__ = [
     "__version__",
     "age_block",
     "evaluation",
-    "jax",
     "make_policy",
     "make_sb3_vec_env",
     "make_task",

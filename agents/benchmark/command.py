@@ -1,12 +1,13 @@
-"""The benchmark: rules and agents of three classes in eight settings, at equal price.
+r"""The benchmark: rules and agents of three classes in eight settings, at equal price.
 
     python -m agents.benchmark --quick --workers 2
     python -m agents.benchmark --suite channels
-    python -m agents.benchmark --policy 'value_of_information:price={price}' --class scheduler
+    python -m agents.benchmark --class scheduler \
+        --policy 'value_of_information:price={price}'
 
 At five prices of every class it tunes the rules of the literature, searches one rule for all
 prices, trains agents, and compares all of them on the same test episodes. Into the results folder
-go the tables, a figure a setting and ``README.md``. With ``--policy`` your own policy is compared
+go the tables, a figure per setting and ``README.md``. With ``--policy`` your own policy is compared
 with the best rule of a class; ``{price}`` in its text stands for the price.
 
 Finished pieces of work stay in the work folder, under a hash of their inputs and of the code, and

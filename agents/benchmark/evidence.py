@@ -126,8 +126,8 @@ class CaseRow(NamedTuple):
 class Trained:
     """A training, its processor seconds, its calibration, and the file of the calibrated policy.
 
-    Where agents cannot be calibrated the policy is the agent. ``rule_places`` are the places of
-    prices at which another rule than the searched one is the learned policy.
+    ``rule_places`` are the places of prices at which another rule than the searched one is the
+    learned policy.
     """
 
     job: TrainingJob
@@ -288,7 +288,7 @@ def tune_thresholds(suite: Suite, runner: Runner, only: ClassName | None = None)
 
 
 def find_rules(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> None:
-    """Search one rule for all prices of each class, its trigger, and thresholds a sensor."""
+    """Search one rule for all prices of each class, its trigger, and thresholds per sensor."""
     places, jobs = list[tuple[Evidence, str]](), []
     for item in classes:
         own = item.setting, item.name, item.prices, suite.generations, runner.folder / "searches"
@@ -336,7 +336,7 @@ def keep_references(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -
     """
     places, jobs = list[tuple[Evidence, Trained]](), []
     for item in classes:
-        if item.setting.calibrated and set(item.references) != {REFERENCE}:
+        if set(item.references) != {REFERENCE}:
             for trained in (t for every in item.trainings.values() for t in every):
                 texts = [f"model:{trained.policy},price={{price}}"] * len(item.prices)
                 places.append((item, trained))
@@ -369,17 +369,13 @@ def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> N
             item.prices, item.rule, suite.calibration_episodes, job.agent,
             job.folder / "calibrated_model.zip",
         )
-        for item, _, job in places if item.setting.calibrated
+        for item, _, job in places
     ]  # fmt: skip
-    every = zip(
-        calibrations, runner.run(run_calibration, calibrations, "calibrations"), strict=True
-    )
-    for (item, kind, job), seconds in zip(places, spent, strict=True):
-        policy, result = job.agent, CalibrationResult(0.0, math.nan, ())
-        if item.setting.calibrated:
-            calibration, result = next(every)
-            policy = calibration.policy
-        item.trainings.setdefault(kind, []).append(Trained(job, seconds, result, policy))
+    results = runner.run(run_calibration, calibrations, "calibrations")
+    every = zip(places, spent, calibrations, results, strict=True)
+    for (item, kind, job), seconds, calibration, result in every:
+        trained = Trained(job, seconds, result, calibration.policy)
+        item.trainings.setdefault(kind, []).append(trained)
 
 
 def test_all(

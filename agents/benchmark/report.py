@@ -29,8 +29,8 @@ GAIN = 0.01  # a difference that the sentences name, and between a mean and a me
 README = Path("README.md")
 TITLES = {"centre": "fusion centre", "local": "local sensors", "scheduler": "centralised scheduler"}
 KNOWLEDGE = {
-    "centre": "what it received, before it asks for a measurement",
-    "local": "each sensor its own measurements and what the centre broadcasts",
+    "centre": "what it received, before it requests a measurement",
+    "local": "each sensor by its own measurements and what the centre broadcasts",
     "scheduler": "the measurements of all sensors and what the centre received",
 }
 
@@ -47,7 +47,7 @@ STYLES = {
     "printed": Style("trigger as printed", "tab:gray", "v"),
     "trigger": Style("tuned trigger", "tab:gray", "v"),
     "threshold": Style("one threshold", "tab:blue", "o"),
-    "thresholds": Style("a threshold a sensor", "tab:blue", "D"),
+    "thresholds": Style("a threshold per sensor", "tab:blue", "D"),
     "rule": Style("searched rule", "black", "s"),
     "informed": Style("searched rule of a scheduler", "black", "o"),
     "learned": Style("learned policy", "tab:orange", "^"),
@@ -95,40 +95,41 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
         f"[Method]({'../' * len(folder.parts)}docs/benchmark.md).",
         headline,
         "## Against the best rule",
-        "Cost over that of the tuned rule which costs least at the price in tuning, %: mean over "
-        "five prices, seeds and episodes; negative: cheaper. A class is what decides, by what it "
-        "knows:",
+        "Cost relative to the tuned rule that costs least in tuning at the same price, %; a "
+        "negative number is cheaper. Each entry is the mean over five prices, seeds and episodes. "
+        "A knowledge class says what decides, and by what:",
         "\n".join(f"- **{TITLES[name]}**: {KNOWLEDGE[name]}." for name in CLASSES),
         class_table(titles, results),
         "\n".join(f"- {text}" for text in sentences(results)),
         "## Two algorithms",
-        "Alone and calibrated with the searched rule. Seconds of a processor for one training; "
-        "cost over the best rule's, %.",
+        "Where two algorithms train, their agents alone and calibrated with the searched rule: "
+        "processor seconds of one training, and cost relative to the best rule, %.",
         comparison_table(titles, results),
         "## Rules of the literature" if named else "",
         table(
-            ("setting", "rule with one tuned threshold", "cost over the best rule's, %"),
+            ("task", "rule with one tuned threshold", "cost relative to the best rule, %"),
             ((titles[r.setting], r.kind, mean_text(r)) for r in results.classes if r.kind in named),
         )
         if named
         else "",
         "## Searched rules",
         table(
-            ("setting", "class", "policy"),
+            ("task", "knowledge class", "policy"),
             ((i.setting.title, TITLES[i.name], f"`{i.priced_rule}`") for i in classes),
         ),
         "## Wrong models",
-        "The scheduler's best rule and learned policy at the three middle prices: the rule's "
-        "cost over its cost with a true model, and the learned policy's cost over the rule's, %.",
+        "The scheduler's best rule and learned policy run in plants that differ from the model, at "
+        "the three middle prices: cost of the rule relative to its cost with a true model, and of "
+        "the learned policy relative to the rule, %.",
         table(
-            ("setting", "case", "rule", "learned policy"),
+            ("task", "case", "rule", "learned policy"),
             (
                 (titles[r.setting], r.case, signed_percent(r.rule, 0), interval(r, r.difference))
                 for r in results.cases
             ),
         ),
         *(
-            f"## {title}\n\n![Error against tokens per step, by class]({name}.png)"
+            f"## {title}\n\n![Error against tokens per step, by knowledge class]({name}.png)"
             for name, title in titles.items()
         ),
     ]
@@ -174,19 +175,21 @@ def headline_text(settings: Sequence[Setting], results: Results) -> str:
     printed, thresholds, rule, informed = medians
     gains = [-row.difference for row in results.classes if row.kind == "learned"]
     text = (
-        "Cost saved against the setting's own trigger, whose parameters are tuned with as many "
-        "episodes as the searched rule: % with a 95 % bootstrap interval over seeds and episodes, "
-        "the mean over five prices in the class of what the trigger knows.\n\n"
-        f"In the median setting the parameters as printed cost {-printed:.0f} % more than tuned "
-        f"ones; at equal knowledge a threshold for each sensor saves {thresholds:.0f} % of the "
-        f"tuned trigger's cost and the searched rule {rule:.0f} %, which becomes {informed:.0f} % "
-        "if one scheduler sees the measurements of all sensors. A learned policy costs "
+        "Cost that a policy saves against the task's trigger, whose parameters are tuned with as "
+        "many episodes as the searched rule: %, with a 95 % bootstrap interval over seeds and "
+        "episodes. Each entry is the mean over five prices, at equal knowledge.\n\n"
+        f"In the median task, the parameters as printed cost {-printed:.0f} % more than tuned "
+        f"ones. One threshold per sensor saves {thresholds:.0f} % of the tuned trigger's cost and "
+        f"the searched rule {rule:.0f} %; if a scheduler sees the measurements of all sensors, the "
+        f"rule saves {informed:.0f} %. A learned policy costs "
         f"{100.0 * float(np.median(gains or [np.nan])):.1f} % less than the best tuned rule in the "
-        f"median of {len(gains)} classes, at most {100.0 * max(gains, default=np.nan):.1f} %; at "
-        f"{sum(row.rule_points for row in every)} of {len(every) * shares} points it is that rule."
+        f"median of {len(gains)} combinations of task and knowledge class, and at most "
+        f"{100.0 * max(gains, default=np.nan):.1f} % less. At "
+        f"{sum(row.rule_points for row in every)} of {len(every) * shares} points it is that rule, "
+        "because no agent beat it in tuning."
     )
     labels = [STYLES[kind].label for kind in kinds[:-1]]
-    heads: Sequence[str] = ("setting", "tuned trigger, class of its knowledge", *labels)
+    heads: Sequence[str] = ("task", "tuned trigger, its knowledge class", *labels)
     heads = *heads, "no policy saves more than", "prices at which it is a rule"
     return f"{table(heads, cells)}\n\n{text}"
 
@@ -209,8 +212,15 @@ def class_table(titles: dict[str, str], results: Results) -> str:
         rule = f"{sum(row.rule_points for row in own)} of {len(own) * shares}"
         lines.append((titles[place[0]], TITLES[place[1]], algorithms, *cells, limit, rule))
     heads = (
-        *("setting", "class", "trained by", "learned policy", "agents alone", "searched rule"),
-        *("one threshold", "a threshold a sensor", "tuned trigger", "optimum or bound"),
+        *(
+            "task",
+            "knowledge class",
+            "trained by",
+            "learned policy",
+            "agents alone",
+            "searched rule",
+        ),
+        *("one threshold", "a threshold per sensor", "tuned trigger", "optimum or bound"),
         "points with a rule",
     )
     return table(heads, lines)
@@ -239,7 +249,8 @@ def comparison_table(titles: dict[str, str], results: Results) -> str:
         for (setting, name, kind), own in trainings.items()
         if (setting, name, "other") in trainings
     ]
-    return table(("setting", "class", "algorithm", "seconds", "agents alone", "calibrated"), lines)
+    heads = "task", "knowledge class", "algorithm", "seconds", "agents alone", "calibrated"
+    return table(heads, lines)
 
 
 def grouped(rows: Sequence[evidence.TrainingRow]) -> Groups:
@@ -276,13 +287,13 @@ def sentences(results: Results) -> list[str]:
     costs = best.groupby(["setting", "name"]).learned.apply(list).tolist()
     near = sum(max(own) - min(own) <= 0.02 for own in costs)
     return [
-        f"The mean over {len(costs)} classes is {mean('learned')} for learned policies and "
+        f"The mean over {len(costs)} rows is {mean('learned')} for learned policies and "
         f"{mean('agent')} for agents alone.",
         f"Learned policies are cheaper at {fewer} of {len(points)} points and dearer at {more}, "
         "with a false discovery rate of 5 %.",
         f"They gain at least {100 * GAIN:.0f} %, with a whole interval, in: {places(-1)}.",
         f"They lose at least {100 * GAIN:.0f} %, with a whole interval, in: {places(1)}.",
-        f"Trainings of one class differ by at most 2 points in {near} of {len(costs)} classes.",
+        f"Trainings of one row differ by at most 2 points in {near} of {len(costs)} rows.",
     ]
 
 

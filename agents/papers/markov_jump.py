@@ -170,7 +170,7 @@ def _summarise_schedule(data: Data) -> Data:
     sent, trace = data["sent"].astype(bool)[:, :_SHOWN], data["trace"]
     shares = sent.mean(1)
     packets, settled = shares.sum(-1), trace[:, -_LAST:].mean(-1)
-    columns = ("node 1", "node 2", "node 3", "packets a step", "mean trace", "settled trace")
+    columns = ("node 1", "node 2", "node 3", "packets per step", "mean trace", "settled trace")
     values = np.column_stack((shares, packets, trace[:, :_SHOWN].mean(-1), settled))
     fused, own = ([period_of(item) for item in curves] for curves in (trace, data["local"]))
     return {

@@ -23,7 +23,7 @@ _CLEAR = 4.0  # standard errors: not reached by chance in some dozens of compari
 def _(schedule: Any) -> Any:
     """A larger threshold sends less.
 
-    Shares of nodes 1, 2, 3 at {shares} together {schedule.packets:.2f} packets a step.
+    Shares of nodes 1, 2, 3 at {shares} together {schedule.packets:.2f} packets per step.
     """
     pairs = zip(schedule.labels, schedule.shares, strict=True)
     shares = " ".join(f"{label}: {number_text(own, '.2f')};" for label, own in pairs)

@@ -3,7 +3,7 @@
     python -m agents.papers tobit_token_bucket
     python -m agents.papers all --resume
 
-Into the output folder go a page a paper (``PAPER.md``), its figures, its numbers
+Into the output folder go a page per paper (``PAPER.md``), its figures, its numbers
 (``PAPER.json``), and ``README.md`` with every claim's verdict. Simulations are kept in the work
 folder as they are finished; ``--resume`` skips those, if they were made from the same inputs by the
 same code.

@@ -222,7 +222,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """Federated fusion is the global optimum of the local estimates.
 
-    with one packet a step it is the centralised Tobit filter for all shares ε: with
+    with one packet per step it is the centralised Tobit filter for all shares ε: with
     {shares[1]} and {shares[2]} no estimate differs by more than {theory.shares_gap:.1g} from the
     estimate with {shares[0]}
     """

@@ -1,6 +1,6 @@
 """Print the documentation's table of filters, triggers and buckets.
 
-    python -m agents.papers.table --config configs/tobit_oscillator_reproduce.yaml
+    python -m agents.papers.table --config tobit_oscillator_reproduce
 
 Every row runs on the same seeds.
 """

@@ -81,8 +81,8 @@ def _summarise_network(data: Data) -> Data:
     rates = zip(data["rate_requested"], data["rate_granted"], strict=True)
     means = {
         "transmissions an event": [data["grant_share"]], "level of tokens": [data["tokens"]],
-        "tokens spent a step": [data["spent"]],
-        "tokens requested a step without a bucket": [data["wanted"]],
+        "tokens spent per step": [data["spent"]],
+        "tokens requested per step without a bucket": [data["wanted"]],
     }  # fmt: skip
     return {
         "tables": {
@@ -196,7 +196,7 @@ def _summarise_bucket_theorems(data: Data) -> Data:
         "share of gains near (37) with a larger bound": [data["gain_larger"]],
         "(42) holds, share of deliveries": [data["holds_delivered"]],
         "(42) holds, share of steps without": [data["holds_silent"]],
-        "growth a step of the trace if nothing is sent": [data["growth"]],
+        "growth per step of the trace if nothing is sent": [data["growth"]],
     }
     each = {f"sensor {m + 1}": [failed] for m, failed in enumerate(data["failed"])}
     failures = {"no sensor": [data["healthy"]], **each, "all sensors": [data["silent"]]}

@@ -44,7 +44,7 @@ def _(network: Any) -> Any:
 def _(network: Any) -> Any:
     """An event trigger alone does not keep the network from being overused; the bucket does.
 
-    Without a bucket the events cost {network.wanted} tokens a step, where {network.rate:g} are
+    Without a bucket the events cost {network.wanted} tokens per step, where {network.rate:g} are
     generated; with it {network.spent} are spent.
     """
     return [below(network.rate, network.wanted), below(network.spent, network.rate)]

@@ -1,4 +1,4 @@
-"""Errors in units of a claimed covariance, whose mean square is at most 1 in every direction."""
+"""Errors in units of an estimated covariance, whose mean square is at most 1 in every direction."""
 
 import numpy as np
 

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ def usage() -> str:
     lines = ["usage: fusion-gym COMMAND [OPTIONS]", ""]
     for name in COMMANDS:
         text = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
-        lines.append(f"  {name:<10} {(ast.get_docstring(ast.parse(text)) or '').splitlines()[0]}")
+        meaning = (ast.get_docstring(ast.parse(text)) or "").splitlines()[0]
+        lines.append(textwrap.fill(f"  {name:<10} {meaning}", 80, subsequent_indent=" " * 13))
     return "\n".join([*lines, "", "fusion-gym COMMAND --help shows the options of a command."])
 
 

@@ -19,9 +19,10 @@ import re
 import shlex
 import sys
 import tempfile
+import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
 
@@ -225,6 +226,9 @@ class EnvironmentOptions:
 
 
 _REGISTRY = tyro.constructors.ConstructorRegistry()
+# What help says of a default that is no value.
+_DEFAULTS = {"": "", "None": "", "False": "", str(tyro.MISSING): "(required)"}
+_WIDTH = 80
 
 
 @_REGISTRY.primitive_rule
@@ -242,24 +246,56 @@ def _optional(
     return replace(spec, is_instance=lambda value: value is None or spec.is_instance(value))
 
 
+@_REGISTRY.struct_rule
+def _command(
+    info: tyro.constructors.StructTypeInfo,
+) -> tyro.constructors.StructConstructorSpec | None:
+    """Show the default of an option where it says more than that the option is absent."""
+    kind: Any = info.type
+    if not (isinstance(kind, type) and issubclass(kind, Command)):
+        return None
+    types, texts = declaration.hints(kind), declaration.meanings(kind)
+    hint = tyro.conf.arg(help_behavior_hint=lambda text: _DEFAULTS.get(text, f"(default: {text})"))
+    options = (
+        tyro.constructors.StructFieldSpec(
+            item.name,
+            Annotated[types[item.name], hint],  # type: ignore[arg-type]
+            tyro.MISSING if item.default is MISSING else item.default,
+            texts.get(item.name),
+        )
+        for item in fields(kind)
+    )
+    return tyro.constructors.StructConstructorSpec(kind, tuple(options))
+
+
 def read_command(kind: type[_Kind]) -> _Kind:
     """Return the command with the options of the command line."""
     _check_words()
-    output = io.StringIO()
+    output, printed = io.StringIO(), io.StringIO()
+    # A paragraph as one line, because tyro keeps a line break before a mark.
+    text = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getmodule(kind).__doc__ or "")
     try:
-        with contextlib.redirect_stderr(output):
+        with contextlib.redirect_stderr(output), contextlib.redirect_stdout(printed):
             return tyro.cli(
                 kind,
                 prog=program_of(kind),
-                description=plain_marks(inspect.getmodule(kind).__doc__ or ""),
+                description=plain_marks(text),
                 registry=_REGISTRY,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as end:
         if end.code:
             print(f"error: {_essence(output.getvalue())}", file=sys.stderr)
+        print(_fold(re.sub(r"\n{3,}", "\n\n", printed.getvalue())), end="")
         flush()
         raise
+
+
+def _fold(text: str) -> str:
+    """Return text with its paragraphs in lines of 80 characters; a space begins another line."""
+    wrapper = textwrap.TextWrapper(_WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = (line.rstrip() for line in text.split("\n"))
+    return "\n".join(line if line[:1] in ("", " ") else wrapper.fill(line) for line in lines)
 
 
 def _check_words() -> None:

@@ -1,7 +1,8 @@
 r"""Compare policies at equal communication: at equal rates, and at equal prices of a token.
 
     fusion-gym compare --env fusion_gym/LinearFusion-v2 --output runs/rules \
-        --policies innovation_threshold value_of_information dynamic_event:scale={value}
+        --policies innovation_threshold value_of_information \
+        dynamic_event:scale={value}
 
 Each rule runs over its first parameter, its parameter ``price`` or the place of ``{value}``, unless
 its text sets the parameter. An agent of several prices runs at all. Two tables show the MSE at

@@ -1,7 +1,8 @@
 r"""Evaluate policies on paired episodes.
 
     fusion-gym evaluate --env fusion_gym/TobitOscillator-v1 --set filter=tobit \
-        --policies always dynamic_event innovation_threshold:threshold=1 --reference always
+        --policies always dynamic_event innovation_threshold:threshold=1 \
+        --reference always
 
 Every policy runs on the same seeds, so all policies meet the same noise. The command writes the
 JSON after each policy; with ``--resume`` it skips the policies that the JSON already contains.

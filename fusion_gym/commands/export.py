@@ -1,7 +1,7 @@
 r"""Export a saved agent as an ONNX file, for sensors and schedulers without this library.
 
-    fusion-gym export zoo:tobit_oscillator_scheduler,price=0.2,calibrated=false \
-        --onnx scheduler.onnx
+    fusion-gym export --onnx scheduler.onnx \
+        zoo:tobit_oscillator_scheduler,price=0.2,calibrated=false
 
 The file contains the graph from the observation to the request, and a description of the
 observation. The command compares it with the agent on 10,000 observations of whole episodes, and

@@ -80,7 +80,7 @@ class Field(FitOptions, Long):
 
         from fusion_gym.recordings import Recording, field_report, field_study, fit, fitting
         from fusion_gym.recordings.field_report import FieldReport
-        from fusion_gym.recordings.field_study import PRACTICE, FieldStudy, MethodPoint, scale
+        from fusion_gym.recordings.field_study import HELD, FieldStudy, MethodPoint, scale
         from fusion_gym.recordings.recording import SHIPPED
 
         whole = Recording.read(self.log, **self.reading)
@@ -142,14 +142,14 @@ class Field(FitOptions, Long):
             files.write_text(self.output / "plant.yaml", text)
             with ended_like_by_ctrl_c():
                 if tolerance:
-                    sizes = scale(study, PRACTICE, np.array(study.shape))
-                    rate = study.call(field_study.run_trial, PRACTICE, sizes, study.source).rate
+                    sizes = scale(study, HELD, np.array(study.shape))
+                    rate = study.call(field_study.run_trial, HELD, sizes, study.source).rate
                     study = replace(study, rate=max(rate, _START))
                 paths = self.measure_methods(study)
             read = {name: files.read_json(path, "output") for name, path in paths.items()}
             points = {name: [MethodPoint(**p) for p in own["points"]] for name, own in read.items()}
             field_report.draw_card(whole, self.output / "card.png")
-            results = [] if tolerance else field_study.compare_with_practice(study, points)
+            results = [] if tolerance else field_study.compare_with_held(study, points)
             field_report.draw_curves(study, points, self.output / "curves.png")
             report = FieldReport(
                 name=Path(self.log).name, whole=whole, recording=recording, study=study,

@@ -1,7 +1,8 @@
 r"""Fit a plant to a log of sensors, and write the option file that ``system=`` takes.
 
     fusion-gym fit mast --exact --output mast.yaml
-    fusion-gym evaluate --env fusion_gym/LinearFusion-v2 --set system=mast.yaml --policies always
+    fusion-gym evaluate --env fusion_gym/LinearFusion-v2 --policies always \
+        --set system=mast.yaml
 
 Level and daily cycle of every channel are removed. The plant is a vector autoregression of the
 rest, fitted to the first part. The table compares its errors with the real errors of the other
@@ -33,11 +34,11 @@ class LogOptions:
     date_format: str | None = None
     """Format of the times, such as %d/%m/%Y %H:%M; by default all rows decide."""
     time_unit: Literal["s", "ms", "us", "ns", "min", "h", "d", "excel"] | None = None
-    """Unit of numeric times; by default their head names it."""
+    """Unit of numeric times; by default the header names it."""
     error_code: tuple[float, ...] = ()
-    """Values that are no readings, beside the recognised ones."""
+    """Values that mean a missing reading, beside the recognised ones."""
     unit: tuple[str, ...] = ()
-    """Units of channels as NAME=UNIT, in place of the heads' units."""
+    """Units of channels as NAME=UNIT, in place of the units in the header."""
 
     @property
     def reading(self) -> Mapping[str, Any]:

@@ -17,10 +17,16 @@ import tyro
 
 from fusion_gym.commands.command_line import Command, OutputFile
 from fusion_gym.commands.fit import LogOptions
-from fusion_gym.envs.registration import base_of, present_id
+from fusion_gym.envs.registration import base_of
 from fusion_gym.output.progress import writing
 from fusion_gym.output.tables import console
 from fusion_gym.validation import nearest, refusal
+
+
+def spelling(name: str) -> str:
+    """Return a name without prefix, version, ending, parameters, case and separators."""
+    name = re.sub(r"^(fusion_gym/|zoo:|configs/)|(-v\d+|\.yaml|[:,].*)$", "", name)
+    return re.sub(r"[\W_]|Env$", "", name).lower()
 
 
 @dataclass(frozen=True)
@@ -28,8 +34,9 @@ class Info(LogOptions, Command):
     """Show the page of an environment, rule, filter, signal, agent or config, or a log's card."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """A name of fusion-gym list, or the CSV file of a log; an environment's name may omit
-    fusion_gym/ and the version, and module:id imports the module first."""
+    """A name of fusion-gym list, or the CSV file of a log. An environment may be LinearFusion,
+    linear_fusion or fusion_gym/LinearFusion-v2, a rule may have parameters, and module:id imports
+    the module first."""
     picture: Annotated[Path | None, OutputFile(".png", ".pdf", ".svg")] = None
     """File for a picture of the log."""
 
@@ -39,10 +46,12 @@ class Info(LogOptions, Command):
         from fusion_gym.commands.list import catalogue
         from fusion_gym.output.plain_text import plain_text
 
-        is_own = re.fullmatch(r"[\w.]+:[\w/-]+", self.name)
-        name, registered = base_of(self.name) if is_own else (present_id(self.name), {})
+        is_own = re.fullmatch(r"(?!zoo:)[\w.]+:[\w/-]+", self.name)
+        name, registered = base_of(self.name) if is_own else (self.name, {})
         entries = catalogue()
-        names = [entry for named in entries.values() for entry in named]
+        names = {spelling(entry): entry for named in entries.values() for entry in named}
+        names |= {entry: entry for entry in names.values()}
+        name = names.get(name) or names.get(spelling(name), name)
         is_log = name in ("mast", "tanks") or ".csv" in Path(name).suffixes
         if name not in names and (is_log or Path(name).is_file()):
             self.show_log()
@@ -52,7 +61,8 @@ class Info(LogOptions, Command):
             if value:
                 raise refusal(option, value, "left out with a name that is no log")
         if name not in names:
-            hint = f"; did you mean {nearest(name, names)!r}?" if nearest(name, names) else ""
+            close = nearest(name, names.values())
+            hint = f"; did you mean {close!r}?" if close else ""
             raise refusal("name", name, f"a CSV file or a name of fusion-gym list{hint}")
         for kind, named in entries.items():
             if name in named:

@@ -149,7 +149,7 @@ def _agent(name: str) -> Entry:
     points = zip(card["test"]["prices"], card["test"]["points"], strict=True)
     names = ("cost", "mse", "tokens")
     rows = [(f"{p:.3g}", *(f"{point[name]:.4g}" for name in names)) for p, point in points]
-    where, head = f"{card['env']} {options}", ("price of a token", "cost", "MSE", "tokens a step")
+    where, head = f"{card['env']} {options}", ("price of a token", "cost", "MSE", "tokens per step")
     return Entry(where, lambda: f"{where}\n\n{table(head, rows)}\n")
 
 

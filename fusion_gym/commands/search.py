@@ -1,7 +1,7 @@
 r"""Search the parameters of a rule; an interrupted search can be resumed.
 
-    fusion-gym search --env fusion_gym/LinearFusion-v2 --set system=plant.yaml token_rate=.5 \
-        --output runs/search
+    fusion-gym search --env fusion_gym/LinearFusion-v2 --output runs/search \
+        --set system=plant.yaml token_rate=.5
 
 Without ``--rule`` one ``priced_threshold`` serves all prices: its threshold depends on the price,
 the tokens and the age. The search over its dozen parameters (CMA-ES) starts from the best single

@@ -1,7 +1,7 @@
 """Train a Stable-Baselines3 agent on the native vector environment.
 
     fusion-gym train --config tobit_oscillator_ppo
-    fusion-gym train --env fusion_gym/LinearFusion-v2 --algorithm ppo --timesteps 200000
+    fusion-gym train --env fusion_gym/LinearFusion-v2 --timesteps 200000
 
 The config's ``output`` folder receives ``config.yaml``, ``latest.zip`` (the checkpoint),
 ``best_model.zip`` (the least validation cost relative to single thresholds),

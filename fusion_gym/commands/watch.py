@@ -1,10 +1,10 @@
 r"""Watch one or two policies through an episode, in a window or as a film.
 
-    fusion-gym watch --env fusion_gym/TobitOscillator-v1 --policy dynamic_event \
-        --against innovation_threshold:threshold=1 --save episode.gif
+    fusion-gym watch --env fusion_gym/TobitOscillator-v1 --save episode.gif \
+        --policy dynamic_event --against innovation_threshold:threshold=1
 
 Both policies meet the same noise. Their pictures stand side by side and share their axes: states
-and fused estimates with two claimed deviations, requests with their answers, tokens.
+and fused estimates with two estimated deviations, requests with their answers, tokens.
 """
 
 import contextlib

@@ -48,7 +48,7 @@ class ChannelOptions(OptionGroup):
     a matrix, or one per sensor. By default ((0.7, 0.3), (0.1, 0.9))."""
     initial_channel: Annotated[InitialState, Scaling()] = "stationary"
     """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
-    law."""
+    distribution."""
     true_drop_probability: ArrayLike | None = None
     """True probability of a loss of independent channels. Estimators and policies assume
     ``drop_probability``, the default. A pair (low, high) is a range from which each episode
@@ -78,7 +78,8 @@ class Channel:
 
     Raises:
         ConfigurationError: A probability is outside [0, 1], a row of the transition does not sum to
-            1, the chain has no unique stationary law, or an option belongs to another channel.
+            1, the chain has no unique stationary distribution, or an option belongs to another
+            channel.
 
     Source: Chakravorty and Mahajan, "Remote estimation over a packet-drop channel with Markovian
     state", IEEE Trans. Automatic Control 65, 2020, Section II.

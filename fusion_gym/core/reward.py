@@ -139,7 +139,7 @@ class RewardOptions(OptionGroup):
     """``"scalar"`` returns the sum of the reward's two terms, ``"vector"`` both terms."""
     error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"
     """Error term of the reward: ``"squared"`` is Σ w_i e_i², ``"trace"`` is Σ w_i P_ii of the
-    claimed covariance P (which a policy can exploit), ``"maximum"`` is max w_i e_i². Otherwise a
+    estimated covariance P (which a policy can exploit), ``"maximum"`` is max w_i e_i². Otherwise a
     function of errors and covariances, or its ``"module:name"``."""
     objective: Annotated[Literal["estimation", "control"] | None, Scaling()] = None
     """Meaning of the error term: ``"estimation"`` is the option ``error``, ``"control"`` is the
@@ -177,7 +177,7 @@ class RewardOptions(OptionGroup):
 class Reward:
     """reward = -(error_weight · D + price · tokens), with D the cost of the error.
 
-    The error e (n, N) is the truth minus the fused estimate, P (n, n, N) its claimed covariance.
+    The error e (n, N) is the truth minus the fused estimate, P (n, n, N) its estimated covariance.
 
     Args:
         options: The options.

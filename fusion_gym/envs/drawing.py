@@ -34,7 +34,7 @@ class _Step(NamedTuple):
 class Film:
     """The last steps of N runs of a task, and a picture of each run.
 
-    A picture shows up to four states with the fused estimate and two claimed standard deviations,
+    A picture shows up to four states with the fused estimate and two estimated standard deviations,
     one row of requests per sensor (granted or denied; if the network can lose or delay packets,
     also lost or late, with a line to the arrival), the input of a controller, and the tokens if
     they are limited. The censored range of a state is shaded. A plant's own picture stands beside
@@ -149,7 +149,7 @@ class Film:
         return list(self._steps)[-min(age, self._window) :] if age else []
 
     def _series(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
-        """Return truth, fused estimate and two claimed deviations, each (steps, shown)."""
+        """Return truth, fused estimate and two estimated deviations, each (steps, shown)."""
         plant, estimator, visible = self.task.plant, self.task.estimator, len(self._state_names)
         estimates = [step.state.estimate for step in steps]
         fused = [(estimator.mean(own), estimator.covariance(own)) for own in estimates]
@@ -183,7 +183,7 @@ class Film:
             (truth,) = axis.plot([], [], color=_TRUTH, lw=1.4, label="state")
             (mean,) = axis.plot([], [], color=_ESTIMATE, lw=1.4, label="fused estimate")
             band = axis.fill_between(
-                [], [], [], color=_ESTIMATE, alpha=0.18, lw=0, label="± 2 claimed deviations"
+                [], [], [], color=_ESTIMATE, alpha=0.18, lw=0, label="± 2 estimated deviations"
             )
             for end, beyond in zip(limits.get(place, ()), (-1e9, 1e9), strict=False):
                 if np.isfinite(end):

@@ -36,7 +36,7 @@ class EpisodeResults:
     Args:
         mse: squared error of the fused estimate (E,), summed over states.
         error_cost: error in the units of the reward (E,), >= 0.
-        bound_trace: trace of the claimed covariance (E,).
+        bound_trace: trace of the estimated covariance (E,).
         nees: normalised squared error (E,), divided by the rank of the covariance; 1 for a
             consistent filter.
         rate: transmissions (E, sensors).
@@ -200,7 +200,7 @@ def _joined(parts: Sequence[EpisodeResults]) -> EpisodeResults:
 
 
 class _Step(NamedTuple):
-    """A step of N runs: the batch after it, its outcome, and the claimed covariance."""
+    """A step of N runs: the batch after it, its outcome, and the estimated covariance."""
 
     batch: EpisodeBatch
     outcome: Outcome
@@ -298,7 +298,7 @@ class Trajectory:
     Args:
         truth: true state (H, n).
         mean: fused estimate (H, n).
-        variance: diagonal of the claimed covariance (H, n).
+        variance: diagonal of the estimated covariance (H, n).
         local_mean: local estimates (H, sensors, n), before the feedback.
         tokens: tokens after each step (H,).
         requested: requests (H, sensors), bool.

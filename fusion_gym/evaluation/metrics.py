@@ -97,7 +97,7 @@ class Metric(NamedTuple):
         meaning: its meaning, in a few words.
         better: values that are better.
         axis: axis of one value each; without one the summary is a mean with its 95 % interval.
-        column: head of its column in printed tables; empty for none.
+        column: header of its column in printed tables; empty for none.
         form: format of its mean in printed tables.
         interval: whether printed tables show the half width of its interval.
         samples: function from results to samples (E,) or (E, axis); the field of
@@ -134,7 +134,7 @@ METRICS = {
         "lower", "state", samples=lambda results: np.sqrt(results.squared_error),
     ),
     "bound_trace": Metric(
-        "trace of the claimed covariance, per step", column="trace P", form=".4g"
+        "trace of the estimated covariance, per step", column="trace P", form=".4g"
     ),
     "nees": Metric("normalised squared error over the rank of the covariance", "1", column="NEES"),
     "rate": Metric("transmissions per step", "lower", "sensor", "rate"),

@@ -385,7 +385,7 @@ class Agreement:
         different: number of observations with another decision.
         difference: greatest difference of the other outputs.
         relative: greatest difference over 1 + the size of the output.
-        rates: transmissions a step of each sensor (sensors,), means over the episodes.
+        rates: transmissions per step of each sensor (sensors,), means over the episodes.
     """
 
     rates: Array
@@ -488,7 +488,7 @@ def onnx_agreement(
 
 
 def warn_of_silent_sensors(rates: Array) -> None:
-    """Warn of sensors that never transmit; ``rates`` are the sensors' transmissions a step."""
+    """Warn of sensors that never transmit; ``rates`` are the sensors' transmissions per step."""
     silent = np.flatnonzero(rates == 0.0).tolist()
     if silent:
         sensors = "no sensor" if len(silent) == len(rates) else f"of the sensors {silent} none"

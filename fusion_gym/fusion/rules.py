@@ -192,7 +192,7 @@ class MatrixWeightedFusion(FusionRule):
         Σᵢ Aᵢ = I. Where Σ is singular it is (eᵀ T⁺ e)⁺ eᵀ T⁺ with T = Σ + e eᵀ.
 
     Assumes: the joint covariance of all errors is known, cross-covariances included; no
-    Gaussian law is needed.
+    Gaussian distribution is needed.
 
     Source: markov_jump, equations (55)-(57); the printed (57), (eᵀ Σ⁻¹ e)⁻¹, needs a regular Σ.
     """

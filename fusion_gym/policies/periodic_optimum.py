@@ -48,10 +48,11 @@ class PeriodicOptimum(Stateless):
 
     - the actual covariance, so the trace is the mean squared error, if the system can compute it
       (CorrelatedTracking-v1; the mean over scales where the noise scale is drawn);
-    - else the claimed covariance. Its trace is the mean squared error in MarkovJumpTracking-v1 with
-      matrix weights or at a centre, and for uncensored Kalman filters with federated fusion. Under
-      covariance intersection it is a bound, and in UnknownInput-v1 it relies on the filter's model
-      of the input. There the best schedule need not have the smallest error.
+    - else the estimated covariance. Its trace is the mean squared error in MarkovJumpTracking-v1
+      with matrix weights or at a centre, and for uncensored Kalman filters with federated
+      fusion. Under covariance intersection it is a bound, and in UnknownInput-v1 it relies on
+      the filter's model of the input. There the best schedule need not have the smallest
+      error.
 
     ``average="steady"`` takes the mean over the steady state, for episodes that are long against
     the transient. ``"episode"`` takes the mean over the task's horizon from the start, as an

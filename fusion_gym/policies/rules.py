@@ -313,7 +313,7 @@ class CentreVariance(Rule):
         The rule requests the last of these sets. P_S is the fused covariance of this step after the
         packets of S, θ is ``threshold``; at most ``at_most`` sensors are added.
 
-    Assumes: claimed covariances that are true.
+    Assumes: correct covariances of the estimators.
 
     Source: the threshold is from S. Trimpe and R. D'Andrea, "Event-based state estimation with
     variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the greedy choice is from
@@ -353,7 +353,7 @@ class VarianceThreshold(Rule):
         of sensor i only, W the reward's weights of the states, θ ``threshold``; ``at_most`` sensors
         are requested.
 
-    Assumes: claimed covariances that are true.
+    Assumes: correct covariances of the estimators.
 
     Source: after S. Trimpe and R. D'Andrea, "Event-based state estimation with variance-based
     triggering", IEEE Trans. Automatic Control 59, 2014.
@@ -433,7 +433,7 @@ class InformationGain(Rule):
         P_∅ is the fused covariance of this step without transmissions, P_{i} with a transmission
         of sensor i only, W the reward's weights of the states, c the tokens of a transmission.
 
-    Assumes: claimed covariances that are true, and that only the next step counts.
+    Assumes: correct covariances of the estimators, and that only the next step counts.
 
     Source: none; the greedy choice of sensors by predicted variance, here per token.
 
@@ -1011,7 +1011,7 @@ class EstimateDifference(BeliefRule):
     Args:
         own: every sensor decides locally, by its memory and the broadcasts.
         threshold: θ >= 0, for all sensors or for each, in the unit of the states or without one.
-        whitened: weigh by the inverse of the centre's claimed covariance.
+        whitened: weigh by the inverse of the centre's estimated covariance.
         at_most: most requests in a step, by the highest value; None for no limit.
 
     Raises:
@@ -1087,7 +1087,7 @@ class KullbackLeibler(BeliefRule):
         N(x̂, P) is the centre's density without transmissions, N(x̂(s), P_s) after the packet of s
         only, n the number of states, θ ``threshold`` in nats.
 
-    Assumes: Gaussian densities, and claimed covariances that are true.
+    Assumes: Gaussian densities, and correct covariances of the estimators.
 
     Source: J. W. Marck and J. Sijs, "Relevant sampling applied to event-based state-estimation",
     SENSORCOMM 2010.

@@ -27,14 +27,14 @@ from fusion_gym.output.files import write_text
 from fusion_gym.output.palette import BLUE, READABLE, VERMILLION
 from fusion_gym.output.tables import table_tables
 from fusion_gym.recordings import ChannelCard, Criticism, DeviceName, Recording, field_study
-from fusion_gym.recordings.field_study import METHODS, PRACTICE, MethodPoint, MethodResult
+from fusion_gym.recordings.field_study import HELD, METHODS, MethodPoint, MethodResult
 from fusion_gym.version import __version__
 
 COLUMNS = (
     "channel", "readings", "missing", "every", "mean", "deviation", "resolution", "saturated",
     "stuck", "spikes", "agreement", "fault",
 )  # fmt: skip
-RATIOS = "packets a sensor and step", "real error", "plant's error", "ratio", "NEES"
+RATIOS = "packets per sensor and step", "real error", "plant's error", "ratio", "NEES"
 CAPTION = (
     "every: steps between two readings · stuck: readings in long runs of one value · agreement: "
     "correlation with the median of the channels of its unit"
@@ -170,13 +170,13 @@ def fields_of(
 
 _CHANGE = "Sensors report on change"
 MEANINGS = {
-    PRACTICE: f"{_CHANGE}, with one scale of all thresholds; the centre holds the last reading.",
-    "practice, one a sensor": f"{_CHANGE}, each with its own threshold; the centre holds the last "
-    "reading.",
-    "silence ignored, one a sensor": f"{_CHANGE}, each with its own threshold; the centre has a "
+    HELD: f"{_CHANGE}, with one scale of all thresholds; the centre holds the last reading.",
+    "held values, one per sensor": f"{_CHANGE}, each with its own threshold; the centre holds the "
+    "last reading.",
+    "silence ignored, one per sensor": f"{_CHANGE}, each with its own threshold; the centre has a "
     "Kalman filter.",
     "silence used": f"{_CHANGE}, with one scale of all thresholds; the centre uses silence.",
-    "silence used, one a sensor": f"{_CHANGE}, each with its own threshold; the centre uses "
+    "silence used, one per sensor": f"{_CHANGE}, each with its own threshold; the centre uses "
     "silence.",
     "centralised": "Value of information: a scheduler sees all readings.",
     "agent": "Counterfactual PPO: a scheduler sees all readings.",
@@ -215,7 +215,7 @@ class FieldReport:
         return next(point for point in self.points[name] if point.packets)
 
     def packets_a_day(self, name: str) -> Array:
-        """Return the packets a day of each sensor (sensors,)."""
+        """Return the packets per day of each sensor (sensors,)."""
         steps = 86_400.0 / self.recording.interval.total_seconds()
         result: Array = steps * np.array(self.point(name).packets)
         return result
@@ -224,14 +224,14 @@ class FieldReport:
 def write_report(report: FieldReport, folder: Path) -> str:
     """Write report.md, report.html and devices.yaml, and return the results and settings."""
     study, whole = report.study, report.whole
-    best, windows = report.best, len(report.points[PRACTICE][0].errors)
+    best, windows = report.best, len(report.points[HELD][0].errors)
     seconds, settings = report.recording.interval.total_seconds(), _settings(report)
     devices = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
     filter_name = METHODS[best][0]
     thresholds = [row["reportable_change"] for row in settings.values()]
     trigger = f' trigger="report_on_change", trigger_threshold={thresholds},'
     trigger = trigger if filter_name == "truncated" else ""
-    target = "the tolerance" if study.tolerance else f"{study.rate:g} packets a sensor and step"
+    target = "the tolerance" if study.tolerance else f"{study.rate:g} packets per sensor and step"
     summary = [
         f"## At {target}",
         f"Settings, packets and errors of a sensor are those of {study.lengths[1]:,} steps in one "
@@ -277,13 +277,13 @@ def _rate_lines(report: FieldReport) -> list[str]:
     """Return the results and the recommendation at equal packets."""
     best = next(row for row in report.results if row.name == report.best)
     return [
-        "Errors are shares of the channels' variance; the difference is to practice at equal "
-        "packets, with a 95 % block-bootstrap interval.",
+        "Errors are shares of the channels' variance. The difference is to held values, which "
+        "devices and centres use today, at equal packets, with a 95 % block-bootstrap interval.",
         results_table(report.results),
         "## Recommendation",
         f"{MEANINGS[best.name]} No other method without a downlink has a smaller error. It is "
-        f"{-best.relative.mean:.0%} lower than practice's at equal packets "
-        f"({-best.relative.high:.0%} to {-best.relative.low:.0%}). For practice's error it takes "
+        f"{-best.relative.mean:.0%} lower than with held values at equal packets "
+        f"({-best.relative.high:.0%} to {-best.relative.low:.0%}). For the same error it takes "
         f"{best.packets:.0%} of the packets.",
     ]
 
@@ -311,7 +311,8 @@ def _tolerance_lines(report: FieldReport) -> list[str]:
         f"Root mean square errors that are allowed: {listed}. The fitted part selects the "
         "settings. Packets are those of all sensors on the other part.",
         table(
-            ("method", "packets a day", "error over its tolerance, fitted part", "other part"), rows
+            ("method", "packets per day", "error over its tolerance, fitted part", "other part"),
+            rows,
         ),
         "## Recommendation",
         f"{MEANINGS[report.best]} {answer}",
@@ -320,31 +321,31 @@ def _tolerance_lines(report: FieldReport) -> list[str]:
 
 def results_table(results: Sequence[MethodResult]) -> str:
     """Return the table of the methods."""
-    heads = ("method", "error", "difference to practice", "packets at practice's error",
+    heads = ("method", "error", "difference to held values", "packets for the same error",
              "real over simulated error")  # fmt: skip
     rows = []
     for result in results:
         low, high = result.relative.low, result.relative.high
         difference = f"{result.relative.mean:+.1%} [{low:+.1%}, {high:+.1%}]".replace("-", "−")
-        own = result.name != PRACTICE
+        own = result.name != HELD
         rows.append((result.name, f"{result.error:.4f}", difference if own else "–",
                      f"{result.packets:.0%}" if own else "–", f"{result.ratio:.2f}"))  # fmt: skip
     return table(heads, rows)
 
 
 def device_table(report: FieldReport) -> str:
-    """Return the table of the recommended settings, beside practice's thresholds."""
-    point, practice = report.point(report.best), report.point(PRACTICE)
+    """Return the table of the recommended settings, beside the thresholds of held values."""
+    point, held = report.point(report.best), report.point(HELD)
     day, rows = report.packets_a_day(report.best), []
-    heads = ("sensor", "reportable_change", "min_interval", "max_interval", "packets a day",
-             "error (rms)", "practice's reportable_change",
+    heads = ("sensor", "reportable_change", "min_interval", "max_interval", "packets per day",
+             "error (rms)", "reportable_change of held values",
              *([f"{report.device} fields"] if report.device else []))  # fmt: skip
     for place, (name, row) in enumerate(_settings(report).items()):
         unit = f" {report.recording.channels[place].unit}".rstrip()
         rows.append((
             name, f"{row['reportable_change']:.4g}{unit}", f"{row['min_interval']:g} s",
             f"{row['max_interval']:g} s", f"{day[place]:.1f}",
-            f"{point.deviations[place]:.3g}{unit}", f"{practice.thresholds[place]:.4g}{unit}",
+            f"{point.deviations[place]:.3g}{unit}", f"{held.thresholds[place]:.4g}{unit}",
             *([json.dumps(row[report.device], ensure_ascii=False)] if report.device else []),
         ))  # fmt: skip
     return table(heads, rows)
@@ -372,7 +373,7 @@ def draw_curves(
         panel.loglog(rate, error, label=name + " (no packets)" * (not rate.size), **style)
     if not study.tolerance:
         panel.axvline(study.rate, color="grey", lw=1, ls=":")
-    panel.set(xlabel="packets a sensor and step", ylabel="error, as a share of the variance")
+    panel.set(xlabel="packets per sensor and step", ylabel="error, as a share of the variance")
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")

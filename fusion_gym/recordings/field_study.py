@@ -31,13 +31,13 @@ from fusion_gym.validation import LONGEST_HORIZON
 
 ENV = "fusion_gym/RecordedFusion-v1"
 FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the target rate, or of 1 / tolerance²
-PRACTICE = "practice"
+HELD = "held values"
 METHODS = {  # name: filter, and whether every sensor has its own threshold
-    PRACTICE: ("hold", False),
-    "practice, one a sensor": ("hold", True),
-    "silence ignored, one a sensor": ("joint", True),
+    HELD: ("hold", False),
+    "held values, one per sensor": ("hold", True),
+    "silence ignored, one per sensor": ("joint", True),
     "silence used": ("truncated", False),
-    "silence used, one a sensor": ("truncated", True),
+    "silence used, one per sensor": ("truncated", True),
     "centralised": ("joint", False),
 }
 _EPISODES, _TRIALS = 32, 150
@@ -49,7 +49,7 @@ Work = dict[str, tuple[int, int]]  # most calls of a function, and steps of a ca
 
 
 class Trial(NamedTuple):
-    """A method's error, packets a sensor and step, and each channel's root mean square error."""
+    """A method's error, packets per sensor and step, and each channel's root mean square error."""
 
     error: float
     rate: float
@@ -57,7 +57,7 @@ class Trial(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """W windows of the log: errors (W,), packets a step (W, l) and root mean square errors (l,).
+    """W windows of the log: errors (W,), packets per step (W, l) and root mean square errors (l,).
 
     The mean of the errors is the weighted mean of the squared errors at the steps with a reading.
     """
@@ -73,7 +73,7 @@ class FieldStudy:
 
     Args:
         options: options of RecordedFusion: plant, log and share.
-        rate: packets a sensor and step.
+        rate: packets per sensor and step.
         shape: thresholds of one scale (sensors,), in the channels' units.
         horizon: steps of a window.
         source: source of the process noise of tuning and training.
@@ -165,9 +165,9 @@ class MethodPoint:
         thresholds: threshold of each sensor, or one, or the price of an agent.
         simulated_error: error in the simulation that tuned it.
         errors: error of each window (W,), relative to the channels' variance.
-        rates: packets a step of each window and sensor (W, sensors).
+        rates: packets per step of each window and sensor (W, sensors).
         order: excess over the tolerance and packets on the fitted part; empty for a rate.
-        packets: packets a step of each sensor on the whole held-out part, at the target alone.
+        packets: packets per step of each sensor on the whole held-out part, at the target alone.
         deviations: root mean square error of each channel there, in its unit.
     """
 
@@ -182,13 +182,13 @@ class MethodPoint:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """A method compared with practice on the held-out part.
+    """A method compared with held values on the held-out part.
 
     Args:
         name: the method.
         error: its error at the target rate.
-        relative: difference of its error to practice's at equal packets, as a share.
-        packets: its packets at practice's error over practice's packets.
+        relative: difference of its error to the error of held values at equal packets, as a share.
+        packets: its packets at the error of held values, over their packets.
         ratio: real over simulated error, each at the same setting.
     """
 
@@ -330,10 +330,10 @@ def scale(
     return np.exp(low) * shape
 
 
-def compare_with_practice(
+def compare_with_held(
     study: FieldStudy, points: Mapping[str, Sequence[MethodPoint]]
 ) -> list[MethodResult]:
-    """Compare all methods with practice at equal packets, with block-bootstrap intervals.
+    """Compare all methods with held values at equal packets, with block-bootstrap intervals.
 
     Args:
         study: the log.
@@ -342,7 +342,7 @@ def compare_with_practice(
     curves = {name: (np.array([point.errors for point in own]),
                      np.array([np.mean(point.rates, axis=1) for point in own]))
               for name, own in points.items()}  # fmt: skip
-    windows = curves[PRACTICE][0].shape[1]
+    windows = curves[HELD][0].shape[1]
     whole = np.arange(windows, dtype=np.int64)
     blocks = np.array_split(whole, max(windows // _BLOCK, 1))
     results = []
@@ -351,21 +351,21 @@ def compare_with_practice(
 
         def relative(sample: Any, name: str = name) -> float:
             places = np.concatenate([blocks[int(block)] for block in sample])
-            least = _error_at(*curves[PRACTICE], study.rate, places)
+            least = _error_at(*curves[HELD], study.rate, places)
             return _error_at(*curves[name], study.rate, places) / least - 1.0
 
         numbers = np.arange(len(blocks))
         mean = relative(numbers)
         low = high = mean
-        if name != PRACTICE and len(blocks) > 1:
+        if name != HELD and len(blocks) > 1:
             ends = stats.bootstrap(
                 (numbers,), relative, vectorized=False, n_resamples=RESAMPLES,
                 confidence_level=LEVEL, method="percentile", rng=np.random.default_rng(0),
             ).confidence_interval  # fmt: skip
             low, high = float(ends.low), float(ends.high)
         error = _error_at(*curves[name], study.rate, whole)
-        practice = _error_at(*curves[PRACTICE], study.rate, whole)
-        packets = _rate_at(*curves[name], practice, whole) / study.rate
+        held = _error_at(*curves[HELD], study.rate, whole)
+        packets = _rate_at(*curves[name], held, whole) / study.rate
         ratio = float(np.mean(middle.errors)) / middle.simulated_error
         results.append(MethodResult(name, error, Interval(mean, low, high), packets, ratio))
     return results

@@ -154,7 +154,7 @@ class Criticism:
     """How well a plant predicts held-out deviations under a periodic schedule.
 
     Args:
-        rate: packets a sensor and step.
+        rate: packets per sensor and step.
         real: mean squared error, each channel over its variance.
         model: the error that the plant predicts.
         nees: normalised squared error of the channels that do not send; 1 for an honest plant.
@@ -198,7 +198,7 @@ def levels(recording: Recording, share: float) -> tuple[Array, int, Array]:
 
     Returns:
         Readings (T, channels) without level and cycle, the number of fitted rows, and the constant,
-        sine and cosine of one and of two periods a day (channels, 5).
+        sine and cosine of one and of two periods per day (channels, 5).
     """
     values, rows = recording.values, int(share * len(recording.values))
     interval = pd.tseries.frequencies.to_offset(recording.interval)
@@ -303,7 +303,7 @@ def criticise(
     Args:
         plant: the plant.
         values: deviations (T, channels), NaN where there is no reading.
-        rates: packets a sensor and step, in (0, 1].
+        rates: packets per sensor and step, in (0, 1].
 
     Example:
         >>> import numpy as np
@@ -321,11 +321,11 @@ def criticise(
         sent = turn % period == 0
         result = plant.filter(np.where(sent, values, np.nan))
         error = truth - result.filtered_state[:count].T
-        claimed = result.filtered_state_cov[:count, :count]
+        covariance = result.filtered_state_cov[:count, :count]
         known = np.isfinite(values)
-        variance = np.diagonal(claimed).clip(0.0)
+        variance = np.diagonal(covariance).clip(0.0)
         real, model = (float((s / scale)[known].mean()) for s in (error**2, variance))
-        rows.append(Criticism(rate, real, model, _nees(error, claimed, known & ~sent)))
+        rows.append(Criticism(rate, real, model, _nees(error, covariance, known & ~sent)))
     return tuple(rows)
 
 
@@ -357,7 +357,7 @@ def residual_correlations(plant: FittedPlant, values: Array) -> Iterator[tuple[s
         yield name, int(size.idxmax()), float(size.max())
 
 
-def _nees(error: Array, claimed: Array, marks: Any) -> float:
+def _nees(error: Array, covariance: Array, marks: Any) -> float:
     """Return the mean over steps of eᵀ P⁻¹ e / rank, of the marked channels."""
     total = count = 0.0
     patterns, places = np.unique(marks, axis=0, return_inverse=True)
@@ -365,7 +365,7 @@ def _nees(error: Array, claimed: Array, marks: Any) -> float:
         (chosen,) = np.nonzero(pattern)
         steps = np.flatnonzero(places == place)
         if len(chosen):
-            part = np.moveaxis(claimed[np.ix_(chosen, chosen, steps)], -1, 0)
+            part = np.moveaxis(covariance[np.ix_(chosen, chosen, steps)], -1, 0)
             own = error[np.ix_(steps, chosen)]
             total += float((own * np.linalg.solve(part, own[..., None])[..., 0]).sum())
             count += len(chosen) * len(steps)

@@ -35,7 +35,7 @@ _ROUND = 3600.0, 60.0, 10.0, 1.0, 0.1, 0.01, 1e-3, 1e-6, 1e-9  # seconds of roun
 _SHARE, _COUNT = 0.05, 3  # most readings and least count of an error code beside the known ones
 _CODES = {-127.0, 85.0, 32767.0, -32768.0, 65535.0, 6553.5, 3276.7, -3276.8, 327.67, -327.68}
 
-TIME_UNITS = {  # and their words in heads
+TIME_UNITS = {  # and their names in headers
     "excel": "excel.*", "s": "s|secs?|seconds?", "ms": "ms|milliseconds?",
     "us": "us|µs|μs|microseconds?", "ns": "ns|nanoseconds?", "min": "mins?|minutes?",
     "h": "h|hrs?|hours?", "d": "d|days?",
@@ -79,7 +79,7 @@ _SPREAD = 3.0  # ratio of the relative deviations of two ways to read a column's
 
 
 def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
-    """Return the cells of a CSV file as texts under its heads."""
+    """Return the cells of a CSV file as texts under its headers."""
     try:
         if path.exists() and not path.is_file():
             raise ValueError("it is no regular file")
@@ -111,9 +111,9 @@ def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
         heads = cells.iloc[0].fillna("").str.lstrip("# ")
         numeric = heads.str.fullmatch(r"[\d\s.,:/TZ+-]+")
         if above and numeric.any():
-            raise ValueError("its rows have more cells than heads: quote decimal commas")
+            raise ValueError("its rows have more cells than headers: quote decimal commas")
         if numeric.all():
-            raise ValueError(f"its heads are numbers, such as {display(heads.iloc[-1])}")
+            raise ValueError(f"its headers are numbers, such as {display(heads.iloc[-1])}")
     except Exception as error:  # a damaged archive may raise any exception
         text = getattr(error, "strerror", None) or " ".join(str(error).split()[:20])
         text = text or type(error).__name__
@@ -124,7 +124,7 @@ def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
         named = units.isin(("", "-", "TS", "RN")) | heads.str.contains(r"\[|\.\.")
         heads = heads.where(named, heads + " [" + units + "]")
         cells = cells.iloc[2 if text.lstrip('"').startswith("TOA5") else 1 :]  # aggregations
-    remarks += [f"{above} lines above the heads: left out"] if above else []
+    remarks += [f"{above} lines above the header: left out"] if above else []
     remarks += [f"{below} lines below the rows: left out"] if below else []
     # Deutscher Wetterdienst's code may be frequent.
     cells = cells.replace("-999", np.nan) if "MESS_DATUM" in set(heads) else cells
@@ -132,7 +132,7 @@ def read_cells(path: Path, remarks: list[str]) -> pd.DataFrame:
 
 
 def _layout(text: str, separators: str) -> tuple[int, str, int]:
-    """Return the number of columns, the separator, and the number of lines above the heads."""
+    """Return the number of columns, the separator, and the number of lines above the header."""
     lines, choices = text.split("\n", _SAMPLE)[:_SAMPLE], []
     for separator in separators:
         widths = [_width(line, separator) for line in lines]

@@ -62,12 +62,12 @@ class Recording:
     ) -> Recording:
         """Read a log from a CSV file.
 
-        A column has the times. The head of every other column is the name of a channel, its unit in
-        brackets and its limits: ``humidity [%] 0..100``; unit and limits may be left out. A file
-        with one row a reading has a column of times, of names and of values. Where columns such as
-        ``room`` or ``id`` name devices, each has its own channels. An empty cell, a word and an
-        error code are no reading. Columns of words are left out. Times are rounded to multiples of
-        the channels' median interval.
+        A column has the times. The header of every other column is the name of a channel, its unit
+        in brackets and its limits: ``humidity [%] 0..100``; unit and limits may be left
+        out. A file with one row per reading has a column of times, of names and of values.
+        Where columns such as ``room`` or ``id`` name devices, each has its own channels.
+        An empty cell, a word and an error code are no reading. Columns of words are left
+        out. Times are rounded to multiples of the channels' median interval.
 
         Args:
             path: the file, which may be compressed, or the name of a shipped log: ``"tanks"`` or
@@ -75,9 +75,9 @@ class Recording:
             date_format: format of the times for ``strftime``. By default all rows decide the order
                 of day and month.
             time_unit: unit of numeric times: ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, ``"min"``,
-                ``"h"``, ``"d"`` or ``"excel"``. By default the head names it.
+                ``"h"``, ``"d"`` or ``"excel"``. By default the header names it.
             error_codes: values that are no readings, beside those that are recognised.
-            units: units of channels by name, in place of the heads' units.
+            units: units of channels by name, in place of the units in the header.
 
         Raises:
             ConfigurationError: the file cannot be read as a log.

@@ -93,7 +93,7 @@ class Bellman:
         return np.minimum(silent, request), silent - request
 
     def mean(self, law: Array, deviation: float, value: Array) -> Array:
-        """Return the mean values (S,) of an error's ``law`` (M,), with the initial tokens.
+        """Return the mean values (S,) of an error's distribution ``law`` (M,), with the initial tokens.
 
         Args:
             law: probabilities of the grid's points.
@@ -281,7 +281,7 @@ def solve_finite(
 ) -> FiniteSolution:
     """Return the least expected cost of ``horizon`` steps by dynamic programming.
 
-    The channel starts in the problem's ``initial`` law.
+    The channel starts in the problem's ``initial`` distribution.
 
     Args:
         problem: the source.
@@ -340,7 +340,7 @@ def lagrangian_bound(
 
     Without ``horizon`` the cost is the average per step, and the supply is ``rate``. With
     ``horizon`` the cost is the sum over an episode, whose channels start in the problems'
-    ``initial`` laws. Its supply is ``initial_tokens`` + ``rate`` · (``horizon`` - 1).
+    ``initial`` distributions. Its supply is ``initial_tokens`` + ``rate`` · (``horizon`` - 1).
 
     Args:
         problems: the sources; their own tokens must be unlimited.

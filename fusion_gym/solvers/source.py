@@ -168,7 +168,7 @@ class SourceProblem:
         error_weight: weight w of the squared error.
         transition: transition matrix of the channel (S, S).
         drop: probability of a loss in each channel state (S,).
-        initial: law of the channel's state at time 0 (S,).
+        initial: distribution of the channel's state at time 0 (S,).
         tokens: levels of the bucket.
 
     Example:
@@ -198,7 +198,7 @@ class SourceProblem:
         bucket: TokenBucket | None = None,
         initial: ArrayLike | None = None,
     ) -> SourceProblem:
-        """Return the checked problem, by default with unlimited tokens and the stationary law."""
+        """Return the checked problem, by default with unlimited tokens and the stationary distribution."""
         matrix = validation.array("transition", transition, (None, None))
         if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
             raise validation.refusal("transition", matrix, "a square matrix whose rows sum to 1")
@@ -307,13 +307,13 @@ class SourceProblem:
         )
 
     def first_law(self, grid: ErrorGrid, spread: float) -> Array:
-        """Return the law (M,) of the first error on a grid, from the deviation of x(0)."""
+        """Return the distribution (M,) of the first error on a grid, from the deviation of x(0)."""
         deviation = float(np.hypot(self.coefficient * spread, self.deviation))
         return gaussian_rows(np.zeros(1), deviation, grid.points)[0]
 
 
 def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
-    """Return the given law of the channel's state at time 0, or the stationary law."""
+    """Return the given distribution of the channel's state at time 0, or the stationary one."""
     states = len(transition)
     if values is not None:
         given = validation.array("initial", values, (states,))
@@ -324,7 +324,9 @@ def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
     balance = np.vstack((transition.T - np.eye(states), np.ones(states)))
     law, _, rank, _ = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0))
     if rank < states:
-        where = f"with transition = {transition.tolist()}, which has no unique stationary law"
+        where = (
+            f"with transition = {transition.tolist()}, which has no unique stationary distribution"
+        )
         allowed = "the probabilities of the states at time 0"
         raise validation.refusal("initial", None, allowed, where)
     return np.asarray(law)

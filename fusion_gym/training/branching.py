@@ -1,4 +1,4 @@
-"""PPO with credit over a window: every set of requests of a decision branches.
+"""PPO with credit over a window: many sets of requests of a decision branch.
 
 From one state and on the same noise, each set runs on for some steps under the policy's likeliest
 actions, by which it is used. A critic that sees the true error and the steps left values the end.

@@ -237,13 +237,13 @@ def warn_of_silence(records: Sequence[PriceRecord]) -> None:
         warnings.warn(
             f"at {len(silent)} of {len(records)} prices the likeliest action spends less than half "
             f"of the tokens of drawn actions (at {row.price:.4g}: {row.tokens:.3g} of "
-            f"{row.drawn_tokens:.3g} a step): fusion-gym calibrate mends it",
+            f"{row.drawn_tokens:.3g} per step): fusion-gym calibrate corrects it",
             stacklevel=2,
         )
 
 
 def warn_of_unused_tokens(task: Task, tokens: float) -> None:
-    """Warn if an agent at its lowest price spends less than half of the sustained tokens a step."""
+    """Warn if an agent spends less than half of the sustained tokens at its lowest price."""
     sustained = sustained_tokens(task)
     share = tokens / sustained if sustained else 1.0
     if share < 0.5 and not task.network.bucket.unlimited:

@@ -124,7 +124,7 @@ def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
     logits = env.view.action.logits(rate)
     head = model.policy.action_net
     assert isinstance(head, torch.nn.Linear)
-    if logits.size == 2 * head.out_features:  # one output a sensor
+    if logits.size == 2 * head.out_features:  # one output per sensor
         logits = logits[1::2]
     with torch.no_grad():
         head.bias.add_(torch.as_tensor(logits, dtype=head.bias.dtype))

@@ -20,11 +20,12 @@ from rich.console import Console
 import fusion_gym
 from agents.benchmark.command import Benchmark
 from fusion_gym.commands import __main__ as everything
-from fusion_gym.commands import command_line
+from fusion_gym.commands import command_line, info
 from fusion_gym.commands.list import catalogue
 from fusion_gym.commands.train import Train
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.output.plain_text import plain_text
+from fusion_gym.policies.registry import policy_names
 from fusion_gym.policies.saved import ALGORITHMS
 from fusion_gym.training.config import TABLE, Experiment, checked, config_path, load_checked
 
@@ -40,7 +41,11 @@ def test_help_shows_every_option(
         load(name).main()
     assert caught.value.code == 0
     printed = capsys.readouterr().out
-    text = " ".join(printed.replace("│", " ").split())
+    assert not [line for line in printed.splitlines() if len(line) > 80 and " " in line.strip()]
+    text = " ".join(printed.split())
+    assert "(default: )" not in text
+    assert "(default: None)" not in text
+    assert "tyro" not in text
     program = command_line.program_of(load(name))
     assert text.startswith(f"usage: {program} ")
     assert f" {program} " in text[10:], "no example"
@@ -56,7 +61,7 @@ def test_help_shows_every_option(
         marks = getattr(hints.get(option), "__metadata__", ())
         if tyro.conf.Positional[int].__metadata__[0] not in marks:
             assert f"--{option.replace('_', '-')} " in listed, option
-    examples = re.findall(r"(?m)^    \S(?:.*\\\n)*.*", printed.partition("╭")[0])
+    examples = re.findall(r"(?m)^    \S(?:.*\\\n)*.*", printed.partition("\n -----")[0])
     assert examples
     for example in (example.replace("\\\n", "") for example in examples):
         assert "\\" not in example
@@ -64,6 +69,20 @@ def test_help_shows_every_option(
         words = shlex.split(example)[len(owner.split()) :]
         monkeypatch.setattr(sys, "argv", ["program", *words])
         command_line.read_command(PROGRAMS[owner])
+
+
+def test_info_takes_every_spelling_of_the_pages() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    text = "".join(page.read_text() for page in pages)
+    rules = "|".join(policy_names("rule"))
+    spellings = re.findall(
+        rf"`((?:fusion_gym/)?\w+-v\d|zoo:[a-z]\w+|configs/\w+\.yaml|(?:{rules}):[^`\n]*)`", text
+    )
+    assert len(set(spellings)) > 30
+    names = {info.spelling(name) for named in catalogue().values() for name in named}
+    assert not {each for each in spellings if info.spelling(each) not in names}
+    assert "fusion_gym/LinearFusion-v2" in call("info", ["linear_fusion"]).out
+    assert "whittle (" in call("info", ["whittle:price=2"]).out
 
 
 def test_lists_and_flags_are_read(monkeypatch: pytest.MonkeyPatch) -> None:

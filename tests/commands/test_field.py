@@ -15,13 +15,13 @@ from fusion_gym.commands import field
 from fusion_gym.recordings import Recording, field_study, fit
 from fusion_gym.recordings.field_report import curve_of, fields_of, longest_interval, step_of
 from fusion_gym.recordings.field_study import (
+    HELD,
     METHODS,
-    PRACTICE,
     FieldStudy,
     MethodPoint,
     Replay,
     Trial,
-    compare_with_practice,
+    compare_with_held,
     measure,
     replay_whole,
     rule_of,
@@ -43,17 +43,17 @@ def test_methods_are_compared_at_equal_packets_and_at_equal_error() -> None:
     """Errors that are powers of the rate: closed forms."""
     factors = (0.5, 0.7, 1.0, 1.4, 2.0)
     points = {
-        PRACTICE: [point(f, 0.4 / f) for f in factors],
+        HELD: [point(f, 0.4 / f) for f in factors],
         "silence used": [point(1.3 * f, 0.1 / (1.3 * f)) for f in factors],
         "centralised": [point(f, 0.3 / f, 0.2) for f in factors],
     }
-    results = {result.name: result for result in compare_with_practice(STUDY, points)}
+    results = {result.name: result for result in compare_with_held(STUDY, points)}
     assert results["silence used"].relative.mean == pytest.approx(-0.75, abs=1e-9)
     assert results["silence used"].relative.high == pytest.approx(-0.75, abs=1e-9)
     assert results["silence used"].packets == pytest.approx(0.25, abs=1e-6)
     assert results["centralised"].relative.low < -0.25 < results["centralised"].relative.high
-    assert results[PRACTICE].packets == pytest.approx(1.0)
-    assert results[PRACTICE].ratio == pytest.approx(1.0)
+    assert results[HELD].packets == pytest.approx(1.0)
+    assert results[HELD].ratio == pytest.approx(1.0)
 
 
 def test_a_curve_rises_in_rate_without_points_that_send_nothing() -> None:
@@ -72,11 +72,11 @@ def test_the_interval_is_that_of_blocks_of_five_windows(level: float) -> None:
     errors = (1.0 + 0.1 * (level * blocks + (1.0 - level) * turns)).tolist()
     rates = [[0.05, 0.05]] * 80
     points = {
-        PRACTICE: [MethodPoint([1.0], 1.0, [1.0] * 80, rates, [])],
+        HELD: [MethodPoint([1.0], 1.0, [1.0] * 80, rates, [])],
         "centralised": [MethodPoint([1.0], 1.0, errors, rates, [])],
     }
     points = {name: own * 2 for name, own in points.items()}
-    relative = compare_with_practice(STUDY, points)[1].relative
+    relative = compare_with_held(STUDY, points)[1].relative
     expected = level * 1.96 * 0.1 / np.sqrt(16)
     assert relative.mean == pytest.approx(0.0, abs=1e-12)
     assert relative.high - relative.mean == pytest.approx(expected, rel=0.1, abs=1e-12)
@@ -127,7 +127,7 @@ def estimates_of_stream(task: Any, sent: Any) -> Any:
 
 
 @pytest.mark.parametrize("log", ["tanks", "mast", 0, 1, 2])
-@pytest.mark.parametrize("method", [PRACTICE, "silence ignored, one a sensor", "silence used"])
+@pytest.mark.parametrize("method", [HELD, "silence ignored, one per sensor", "silence used"])
 def test_what_is_reported_is_one_replay_of_the_other_part(
     log: Any, method: str, tmp_path: Path
 ) -> None:
@@ -163,7 +163,7 @@ def test_what_is_reported_is_one_replay_of_the_other_part(
 
 
 @pytest.mark.parametrize("tolerance", [(), (0.5, 0.5)])
-@pytest.mark.parametrize("name", ["centralised", "silence used, one a sensor"])
+@pytest.mark.parametrize("name", ["centralised", "silence used, one per sensor"])
 def test_each_simulation_advances_the_progress_to_its_total(
     name: str, tolerance: tuple[float, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,7 +252,7 @@ def test_the_least_packets_keep_the_tolerance_with_what_a_device_holds(
     tolerance, steps = (0.3, 1.5), max(intervals) // 600
     study = FieldStudy(options, 10.0 / steps, (1.0, 1.0), 20, "normal", tolerance,
                        lengths=(1440, 960))  # fmt: skip
-    method = "silence used" if "truncated" in code else PRACTICE
+    method = "silence used" if "truncated" in code else HELD
     excess = []
     for factor in (1.0, 1.1):
         own = rule_of(study, method, factor * thresholds)
@@ -377,7 +377,7 @@ def test_a_log_with_noise_is_studied_without_further_options(
     assert (tmp_path / "field" / "devices.yaml").exists()
 
 
-@pytest.mark.parametrize("method", [PRACTICE, "silence ignored, one a sensor", "silence used"])
+@pytest.mark.parametrize("method", [HELD, "silence ignored, one per sensor", "silence used"])
 def test_errors_of_a_log_with_noise_are_those_of_the_quantity(method: str, tmp_path: Path) -> None:
     """Which the test knows; the noise is as large as the process noise."""
     noisy, true = tmp_path / "log.csv", tmp_path / "true.csv"

@@ -201,7 +201,7 @@ def test_programs_do_not_grow_with_the_number_of_runs(name: str, options: dict[s
         return np.array([len(program.as_text()) for program in programs])
 
     runs = 16_384
-    arrays = 4 * 16 * runs  # hexadecimal digits of four numbers a run
+    arrays = 4 * 16 * runs  # hexadecimal digits of four numbers per run
     assert (lengths(runs) < 1.2 * lengths(64) + arrays).all()
 
 

@@ -23,7 +23,7 @@ RUNS, STEPS = 5, 14
 DELAY = (0, 2)
 FREE: dict[str, Any] = {"tokens": "unlimited", "access": "any"}
 UNCENSORED = {"filter": "kalman", "censoring_threshold": -np.inf}
-# Every environment whose packets carry measurements; a third filter of practice holds values.
+# Every environment whose packets carry measurements; a third filter holds values.
 SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("LinearFusion-v2", {}),
     ("LinearFusion-v2", {"filter": "hold"}),

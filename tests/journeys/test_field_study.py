@@ -30,7 +30,7 @@ def test_a_study_ends_in_the_settings_of_devices(
     assert all(row["max_interval"] == 12_000.0 for row in settings.values())
     assert all(0.1 < row["reportable_change"] < 30.0 for row in settings.values())
     report = (folder / "report.md").read_text()
-    for text in (*METHODS, AGENT, "packets a day", "`devices.yaml`", "![Error over packets]"):
+    for text in (*METHODS, AGENT, "packets per day", "`devices.yaml`", "![Error over packets]"):
         assert text in report
     assert printed.strip() in report
     assert "<table>" in (folder / "report.html").read_text()
@@ -41,7 +41,7 @@ def test_a_study_ends_in_the_settings_of_devices(
     assert "already holds a study" in refusal("field", words)
     assert "target_rate = 0.1 differs" in refusal("field", [*words, "--target-rate=.1", "--resume"])
     (folder / "silence_used.json").unlink()
-    before = json.loads((folder / "practice.json").read_text())
+    before = json.loads((folder / "held_values.json").read_text())
     again = succeed("field", [*words, "--resume"]).out
     assert again == printed
-    assert json.loads((folder / "practice.json").read_text()) == before
+    assert json.loads((folder / "held_values.json").read_text()) == before

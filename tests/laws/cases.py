@@ -267,7 +267,7 @@ each_id = pytest.mark.parametrize("env_id", IDS, ids=short)
 
 
 def requests(task: Task, runs: int, steps: int, rate: float = 0.4) -> NDArray[np.bool_]:
-    """Random requests (steps, sensors, runs), always the same; one a step with single access."""
+    """Random requests (steps, sensors, runs), always the same; one per step with single access."""
     request = np.random.default_rng(7).random((steps, task.sensors, runs)) < rate
     return request & (request.cumsum(1) == 1) if task.options.access == "single" else request
 

@@ -28,7 +28,7 @@ def task_of(name: str, **options: Any) -> Any:
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("rate", [0.05, 0.1, 0.3])
 def test_slotted_aloha_delivers_by_its_formula(rate: float, channels: int) -> None:
-    """n p (1 - p/k)^(n - 1) packets a step of n sensors on k channels, and all n p are paid."""
+    """n p (1 - p/k)^(n - 1) packets per step of n sensors on k channels, and all n p are paid."""
     sensors, runs, steps = 12, 400, 60
     task = task_of("RemoteEstimation", sensors=sensors, access="collision", channels=channels)
     policy = make_policy(f"random:rate={rate}", task)
@@ -142,7 +142,7 @@ def test_a_sensor_that_does_not_learn_of_losses_competes_by_what_it_sent() -> No
 
 TURNS, INNOVATION = {"access": "round_robin"}, {"access": "try_once_discard"}
 HELD = INNOVATION | {"discrepancy": "held"}
-# Mean squared errors of round robin and of both discrepancies at one packet a step.
+# Mean squared errors of round robin and of both discrepancies at one packet per step.
 ROWS = {
     "BiasedTracking": (1.591, 1.668, 1.368),
     "UnknownInput": (0.105, 0.099, 0.098),

@@ -40,7 +40,7 @@ def test_what_remains_is_reported_by_the_mean_speed_and_waits(clock: Any) -> Non
     with progress_bar(1000, "training", initial=200, quiet=True) as bar:
         assert left() == "? left"
         clock.now += 10.0
-        bar.update(200)  # 20 steps a second, and 600 are left
+        bar.update(200)  # 20 steps per second, and 600 are left
         assert left() == "0:00:30 left"
         clock.now += 112.0
         assert left() == "0:00:30 left"

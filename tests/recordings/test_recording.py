@@ -101,7 +101,7 @@ REFUSED = {
     "many columns": ("t" + ",x" * 300, "(301 columns: above 100,000,000 bytes or 100 channels"),
     "decimal commas without quotes": (
         "time,a,b\n" + "".join(f"{time},1,5,2,{n}\n" for n, time in enumerate(log()["time"])),
-        "more cells than heads: quote decimal commas",
+        "more cells than headers: quote decimal commas",
     ),
     "a line without an end": ("x" * 200_000, "field larger than field limit"),
     "numbers without a unit": (log(time=np.arange(60)), "numbers a unit in the head"),
@@ -109,7 +109,7 @@ REFUSED = {
         pd.concat([log(2)[["time"]].assign(name=name, value=1.0) for name in range(101)]),
         "has 101 channels and 0 readings at the time of another; export",
     ),
-    "no heads": ("\n".join(TEXT.splitlines()[1:]), "its heads are numbers, such as"),
+    "no heads": ("\n".join(TEXT.splitlines()[1:]), "its headers are numbers, such as"),
     "days of two orders": (log(time=clock("%d/%m/%Y %H:%M", 60, "10min", "2024-03-05")), "--date"),
     "a sign of two meanings": (log()[["time"]].assign(d="1,500"), "decimal or separates thousands"),
     "some decimal commas": (TEXT + "2026-03-02 00:00:00,1,5,2,3\n", "saw 5; quote decimal commas"),

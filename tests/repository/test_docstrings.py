@@ -58,7 +58,7 @@ NAMES = sorted(REFERENCE)
 
 
 def test_the_reference_has_every_public_name() -> None:
-    modules = {"evaluation", "jax", "wrappers", "zoo"}
+    modules = {"evaluation", "wrappers", "zoo"}
     names = {f"fusion_gym.{name}" for name in {*fusion_gym.__all__} - modules - {"__version__"}}
     names |= {f"fusion_gym.evaluation.{name}" for name in evaluation.__all__}
     names |= {f"fusion_gym.wrappers.{name}" for name in wrappers.__all__}

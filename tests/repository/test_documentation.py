@@ -15,7 +15,7 @@ import fusion_gym
 from agents.benchmark.report import headline_text
 from agents.benchmark.settings import load_suite
 from docs.tables import PART, TABLES, written
-from fusion_gym.envs.option_text import options_in
+from fusion_gym.envs.option_text import options_in, short
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 
 README = (ROOT / "README.md").read_text()
@@ -50,6 +50,7 @@ def test_markdown_leaves_formulas_as_written(path: Path) -> None:
 
 QUESTIONS = {
     "the options of an environment": "docs/tobit_oscillator.md#options",
+    "the options of every environment": "docs/options.md#tokens",
     "the entries of an observation": "docs/remote_estimation.md#observation",
     "the list of rules": "docs/rules.md#rules",
     "the list of filters": "docs/filters.md#filters",
@@ -123,8 +124,18 @@ def test_every_option_and_entry_has_a_meaning_and_a_table(env_id: str) -> None:
     meanings |= {block.name: block.meaning for block in blocks}
     assert not [name for name, meaning in meanings.items() if not meaning]
     page = doc_of(env_id)
-    assert re.search(rf"<!-- table: options .*{env_id}", page)
     assert "<!-- table: observation " in page
+    assert re.search(rf"<!-- table: options .*{env_id}", page)
+    pages = page + (ROOT / "docs/options.md").read_text()
+    pages += (
+        doc_of("fusion_gym/LinearFusion-v2") if " beyond fusion_gym/LinearFusion-v2" in page else ""
+    )
+    for name, option in options_in(options_of(env_id)).items():
+        value = short(option.default).replace("'", '"')
+        rows = re.findall(rf"^\| `{name}` .*$|`{name}=.*", pages, re.MULTILINE)
+        assert len(value) >= 60 or any(
+            f"{value}`" in row or f"{value} or" in row for row in rows
+        ), name
 
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

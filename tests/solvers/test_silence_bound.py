@@ -171,7 +171,7 @@ def test_the_bound_falls_with_the_rate_and_every_price_gives_one() -> None:
     dear, cheap = bound.at(0.03)[1], bound.at(0.1)[1]
     assert dear.price > cheap.price
     assert dear.rate == pytest.approx(0.03, rel=0.1)
-    # The cost is concave in the price, its slope the packets a step.
+    # The cost is concave in the price, its slope the packets per step.
     slope = (dear.lower - cheap.lower) / (dear.price - cheap.price)
     assert 3 * dear.rate < slope < 3 * cheap.rate
 

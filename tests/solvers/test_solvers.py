@@ -309,7 +309,7 @@ def test_joint_optimum_lies_between_the_dual_bound_and_the_best_schedule(drop: f
     ages = solve_ages(tuple(by_age(source, sharing=2.0) for source in sources), at_most=1).cost
     assert bound < joint.cost < ages
     assert ages > 1.4 * joint.cost
-    # With one packet a step the larger error goes first where all else is equal.
+    # With one packet per step the larger error goes first where all else is equal.
     same = (sources[0], sources[0])
     choice = solve_joint_average(JointProblem.create(same, at_most=1)).choice[..., 0]
     first, two = np.indices(choice.shape)

@@ -57,7 +57,7 @@ def test_traffic_entropy_and_validation_at_each_price_are_shown(
     requested, granted = visible["rollout/requested"], visible["rollout/granted"]
     assert all(0.0 <= few < many < 1.0 for few, many in zip(granted, requested, strict=True))
     assert max(granted) > 0.0
-    assert max(granted) <= 0.5 / 3 / 3 + 0.05  # tokens a step, cost, sensors
+    assert max(granted) <= 0.5 / 3 / 3 + 0.05  # tokens per step, cost, sensors
     if kind != "dqn":
         entropy = visible["train/entropy_per_sensor"]
         assert all(0.0 < value <= math.log(2) + 1e-6 for value in entropy)

@@ -113,7 +113,7 @@ class BiasedOscillatorOptions(system.FeedbackOptions):
 class BiasedTrackingOptions(BiasedOscillatorOptions):
     """A target with an unknown acceleration, whose position and velocity are measured.
 
-    The state is position in metres and velocity in metres a second, sampled every 0.1 s; the bias
+    The state is position in metres and velocity in metres per second, sampled every 0.1 s; the bias
     is the acceleration. Sensor 0 measures the position, sensor 1 the velocity, practically
     uncensored. One of them may transmit per step. The nodes run Tobit Kalman filters on state and
     bias together. The centre fuses them and feeds the result back.

@@ -531,7 +531,7 @@ class HoldCentre(Centre):
     Assumes: deliveries at times that do not depend on the values, for P; and sensors that together
     determine the state.
 
-    Source: none; the hold of control practice, with the moments of the model.
+    Source: none; the hold of industrial controllers, with the moments of the model.
     """
 
     filter: KalmanFilter

@@ -275,7 +275,7 @@ class StochasticEventFilter(KalmanFilter):
 
     The filter is exact if the policy is ``stochastic_event`` with this weight, every request
     arrives at once and the sensors are uncensored. After a denial or a loss, under censoring or
-    with a policy that transmits less, the claimed covariance is too small.
+    with a policy that transmits less, the estimated covariance is too small.
 
     ``weight`` has shape (sensors, 1), in the inverse squared unit of the measurement, >= 0; with
     weight 0 silence carries no information.

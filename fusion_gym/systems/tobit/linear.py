@@ -73,7 +73,7 @@ class LinearFusionOptions(system.FeedbackOptions):
     it.
 
     The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration. One
-    sensor measures its position in metres, one its velocity in metres a second.
+    sensor measures its position in metres, one its velocity in metres per second.
 
     v2: ``reward_scale`` multiplies the state weights: by default requests at an even pace have
     errors that cost 1 a step. These errors scale the entries of beliefs. The price of a token is

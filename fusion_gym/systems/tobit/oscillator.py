@@ -45,7 +45,7 @@ class TobitOscillatorOptions(system.FeedbackOptions):
 
     The plant is a rotation by 0.052 π a step, driven by noise. Three sensors measure both states
     with noise of variance 0.5 and report max(z, 0) of each component. At every step the policy
-    requests transmissions. The bucket (5 tokens a step, 30 at most, 3 a transmission) grants or
+    requests transmissions. The bucket (5 tokens per step, 30 at most, 3 a transmission) grants or
     denies. Each node runs a Tobit Kalman filter on its deliveries; the centre fuses the three and
     feeds the result back.
 
