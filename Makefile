@@ -140,9 +140,8 @@ $(VENV)/.docs: $(STAMP)
 	$(INSTALL) --editable '.[agents,docs]'
 	touch $@
 
-pages: $(STAMP)  ## tables and the picture of networks in docs/, from the code
+pages: $(STAMP)  ## tables in docs/, from the code
 	$(BIN)/python -m docs.tables
-	$(BIN)/python -m docs.protocols
 
 docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, links checked
 	$(BIN)/python -m docs.tables --check

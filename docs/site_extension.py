@@ -1,6 +1,5 @@
-"""What the site adds to Sphinx: pages as notebooks, links to names, folds, formulas."""
+"""What the site adds to Sphinx: pages as notebooks, links to names, formulas."""
 
-import html
 import re
 from typing import Any
 
@@ -52,24 +51,6 @@ def lead_to_names(app: Sphinx, doctree: nodes.document) -> None:
             node.replace_self(pending_xref("", *node.children, **target, refspecific=True))
 
 
-def fold(app: Sphinx, doctree: nodes.document, name: str) -> None:
-    """Fold long blocks of code, and the reproduced figures below their headings."""
-    for block in list(doctree.findall(nodes.literal_block)):
-        lines = block.astext().splitlines()
-        if len(lines) > 80:
-            block.parent.replace(block, _folded(f"{len(lines)} lines", [block]))
-    if name.startswith("docs/reproduction/"):
-        for node in doctree.findall(nodes.section):
-            if re.match("Figure|Table", node[0].astext()):
-                node[1:] = _folded("the picture", node[1:])
-
-
-def _folded(summary: str, content: list[nodes.Node]) -> list[nodes.Node]:
-    opening = f"<details><summary>{html.escape(summary)}</summary>"
-    ends = (nodes.raw("", text, format="html") for text in (opening, "</details>"))
-    return [next(ends), *content, next(ends)]
-
-
 def write_formulas(
     app: Sphinx, what: str, name: str, owner: Any, options: Any, lines: list[str]
 ) -> None:
@@ -89,7 +70,6 @@ def write_formulas(
 def setup(app: Sphinx) -> dict[str, bool]:
     """Connect the changes of pages and docstrings."""
     app.connect("doctree-read", lead_to_names, priority=400)  # before files to download are copied
-    app.connect("doctree-resolved", fold)
     app.connect("autodoc-process-docstring", write_formulas)
     app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True  # it names a file alone
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -9,7 +9,7 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "docs" / name for name in ("other_libraries.md", "recipes.md")]
-PAGE = "".join(path.read_text(encoding="utf-8") for path in PAGES)
+PAGE = "\n## ".join(path.read_text(encoding="utf-8") for path in PAGES)
 
 
 def section(library: str) -> str:

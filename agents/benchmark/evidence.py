@@ -126,8 +126,8 @@ class CaseRow(NamedTuple):
 class Trained:
     """A training, its processor seconds, its calibration, and the file of the calibrated policy.
 
-    ``rule_places`` are the places of prices at which another rule than the searched one is the
-    learned policy.
+    Where agents cannot be calibrated the policy is the agent. ``rule_places`` are the places of
+    prices at which a rule is the learned policy without calibration.
     """
 
     job: TrainingJob
@@ -140,7 +140,7 @@ class Trained:
     def rule_points(self) -> int:
         """Number of prices at which the learned policy is a rule."""
         points = enumerate(self.calibration.points)
-        return sum(place in self.rule_places or point.mixture == 1.0 for place, point in points)
+        return len({*self.rule_places, *(k for k, point in points if point.mixture == 1.0)})
 
     def learned(
         self, outcomes: TestResults, reference: TestResults, places: Sequence[int]
@@ -336,7 +336,7 @@ def keep_references(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -
     """
     places, jobs = list[tuple[Evidence, Trained]](), []
     for item in classes:
-        if set(item.references) != {REFERENCE}:
+        if set(item.references) != {REFERENCE} or not item.setting.calibrated:
             for trained in (t for every in item.trainings.values() for t in every):
                 texts = [f"model:{trained.policy},price={{price}}"] * len(item.prices)
                 places.append((item, trained))
@@ -346,7 +346,8 @@ def keep_references(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -
         places_of_rules = []
         for place, kind in enumerate(item.references):
             gain = item.choice[kind][place].cost - outcomes[place].cost
-            if kind != REFERENCE and gain.mean() <= 2.0 * gain.std(ddof=1) / len(gain) ** 0.5:
+            mixed = kind == REFERENCE and item.setting.calibrated  # with this rule, by calibration
+            if not mixed and gain.mean() <= 2.0 * gain.std(ddof=1) / len(gain) ** 0.5:
                 places_of_rules.append(place)
         trained.rule_places = tuple(places_of_rules)
 
@@ -369,13 +370,17 @@ def train_agents(suite: Suite, runner: Runner, classes: Sequence[Evidence]) -> N
             item.prices, item.rule, suite.calibration_episodes, job.agent,
             job.folder / "calibrated_model.zip",
         )
-        for item, _, job in places
+        for item, _, job in places if item.setting.calibrated
     ]  # fmt: skip
-    results = runner.run(run_calibration, calibrations, "calibrations")
-    every = zip(places, spent, calibrations, results, strict=True)
-    for (item, kind, job), seconds, calibration, result in every:
-        trained = Trained(job, seconds, result, calibration.policy)
-        item.trainings.setdefault(kind, []).append(trained)
+    every = zip(
+        calibrations, runner.run(run_calibration, calibrations, "calibrations"), strict=True
+    )
+    for (item, kind, job), seconds in zip(places, spent, strict=True):
+        policy, result = job.agent, CalibrationResult(0.0, math.nan, ())
+        if item.setting.calibrated:
+            calibration, result = next(every)
+            policy = calibration.policy
+        item.trainings.setdefault(kind, []).append(Trained(job, seconds, result, policy))
 
 
 def test_all(

@@ -87,6 +87,7 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
     for name, title in titles.items():
         draw_setting([row for row in results.policies if row.setting == name], title, folder)
     headline = headline_text(suite.settings, results)
+    others = any(row.kind == "other" for row in results.trainings)
     named = {kind for setting in suite.settings for kind in setting.named_rules}
     page = [
         f"# {suite.title}",
@@ -101,10 +102,12 @@ def write_results(suite: Suite, classes: Sequence[evidence.Evidence], folder: Pa
         "\n".join(f"- **{TITLES[name]}**: {KNOWLEDGE[name]}." for name in CLASSES),
         class_table(titles, results),
         "\n".join(f"- {text}" for text in sentences(results)),
-        "## Two algorithms",
+        "## Two algorithms" if others else "",
         "Where two algorithms train, their agents alone and calibrated with the searched rule: "
-        "processor seconds of one training, and cost relative to the best rule, %.",
-        comparison_table(titles, results),
+        "processor seconds of one training, and cost relative to the best rule, %."
+        if others
+        else "",
+        comparison_table(titles, results) if others else "",
         "## Rules of the literature" if named else "",
         table(
             ("task", "rule with one tuned threshold", "cost relative to the best rule, %"),

@@ -78,6 +78,11 @@ class Setting(Strict):
     error: Literal["squared", "excess", "mismatch"] = "mismatch"
     cases: tuple[Case, ...] = ()
 
+    @property
+    def calibrated(self) -> bool:
+        """Whether agents are calibrated: they have a logit for each sensor."""
+        return self.options.get("access") != "assignment"
+
     def has_memory(self, name: ClassName) -> bool:
         """Return whether the policies of a class have memory."""
         return self.memory and name != "centre"

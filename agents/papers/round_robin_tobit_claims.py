@@ -27,7 +27,7 @@ CONSISTENT = 0.05  # deviation of NEES from 1
 def _(oscillator: Any) -> Any:
     """FTKF-DB tracks states and bias precisely.
 
-    it explains {explained:%} of the open-loop variance of x1, x2, b (precise: 90 % or more)
+    It explains {explained:%} of the open-loop variance of x1, x2, b (precise: 90 % or more)
     """
     explained = _explained(oscillator, "aware")
     return explained >= PRECISE, locals()
@@ -37,7 +37,7 @@ def _(oscillator: Any) -> Any:
 def _(oscillator: Any) -> Any:
     """FTKF deviates considerably and cannot track the bias.
 
-    it explains {explained:%} of the open-loop variance of x1, x2, b
+    It explains {explained:%} of the open-loop variance of x1, x2, b
     """
     explained = _explained(oscillator, "unaware")
     return [explained[:2] < PRECISE, explained[2] < 0.05], locals()
@@ -47,7 +47,7 @@ def _(oscillator: Any) -> Any:
 def _(oscillator: Any) -> Any:
     """RMSE1 and RMSE2 of FTKF-DB are always smaller than with FTKF.
 
-    of 2 states at every step it is {often}
+    Of 2 states at every step it is {often}
     """
     outcome, often = always_below(oscillator.difference[..., :2])
     return outcome, locals()
@@ -65,7 +65,7 @@ def _(oscillator: Any) -> Any:
 def _fused(states: slice, nodes: Any) -> Any:
     higher, texts = defaultdict(list), []
     for reading, name in (("single filters", "single"), ("nodes of Table I", "node")):
-        texts.append(f"{reading}:")
+        texts.append(f"{reading[0].upper()}{reading[1:]}:")
         for i in range(2):
             ends = nodes[f"{name}_{i}_increase"]
             mean, low, high = (ends[end][states] for end in ("mean", "low", "high"))
@@ -105,7 +105,7 @@ def _(tables: Any) -> Any:
 def _(target: Any) -> Any:
     """RMSE of position and velocity of FTKF-DB are always smaller than with FTKF.
 
-    of 2 states at every step it is {often}
+    Of 2 states at every step it is {often}
     """
     outcome, often = always_below(target.difference[..., :2])
     return outcome, locals()
@@ -137,7 +137,7 @@ def _(target: Any) -> Any:
 def _(theory: Any) -> Any:
     """(12) is the mean of a censored measurement.
 
-    at {count} values of x1, simulated means differ clearly at {printed} with ϑ over R as
+    At {count} values of x1, simulated means differ clearly at {printed} with ϑ over R as
     printed (x1 = {place:g}: {mean:.4f}, by (12) {claimed:.4f}), and at {right} with ϑ over
     √R, as (16) and (17) imply
     """
@@ -153,7 +153,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """(13) is the variance of a censored measurement.
 
-    simulated variances differ clearly from it at {count} of {places} values of x1 (x1 =
+    Simulated variances differ clearly from it at {count} of {places} values of x1 (x1 =
     {place:g}: {variance:.4g}, by (13) {claimed:.4g}): it is the variance conditional on no
     censoring. They differ at {total} from the law of total variance; with that law in the place
     of (13) the filter diverges
@@ -170,7 +170,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """(9) approximates the censoring probabilities.
 
-    predicted minus simulated share of uncensored packets: {gap}; but where (9) predicts less
+    Predicted minus simulated share of uncensored packets: {gap}; but where (9) predicts less
     than {sure:%}, on average they occur {times:.3g} times as often, because (9) neglects the
     prediction's error
     """
@@ -193,7 +193,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """The local estimate is E{ξ | y}, of least error.
 
-    the assumed-density filter, on the same packets, has a squared error of {means[1]:.3g}
+    The assumed-density filter, on the same packets, has a squared error of {means[1]:.3g}
     instead of {means[0]:.3g} (difference {difference})
     """
     means, difference = _difference(theory.mse_paper, theory.mse_adf)
@@ -204,7 +204,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """Errors of the prediction are uncorrelated in time (supposed).
 
-    correlation of the bias's prediction errors at successive steps: {values}. This has no
+    Correlation of the bias's prediction errors at successive steps: {values}. This has no
     effect under the round robin: where it would matter (24) has gain zero
     """
     weights, conditions, texts = resampled(theory.episodes), [], []
@@ -222,7 +222,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """Federated fusion is the global optimum of the local estimates.
 
-    with one packet per step it is the centralised Tobit filter for all shares ε: with
+    With one packet per step it is the centralised Tobit filter for all shares ε: with
     {shares[1]} and {shares[2]} no estimate differs by more than {theory.shares_gap:.1g} from the
     estimate with {shares[0]}
     """
@@ -234,7 +234,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """Without bias and round robin it is the usual Tobit filter.
 
-    with B = 0 and all packets at every step, its estimates of x differ by
+    With B = 0 and all packets at every step, its estimates of x differ by
     {theory.without_gap:.1g} from the estimates of the filter without a bias
     """
     return theory.without_gap < 1e-9
@@ -244,7 +244,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """Censored observations, inadequately handled, impair the performance.
 
-    the Kalman filter that ignores censoring has a squared error of {means[1]:.3g}, the Tobit
+    The Kalman filter that ignores censoring has a squared error of {means[1]:.3g}, the Tobit
     filter {means[0]:.3g} (difference {difference})
     """
     means, difference = _difference(theory.mse_paper, theory.mse_kalman)
@@ -255,7 +255,7 @@ def _(theory: Any) -> Any:
 def _(theory: Any) -> Any:
     """FTKF is insensitive to dynamical biases and censored observations.
 
-    censoring at ±5 makes ARMSE1, 2, 3 {worse:.2g} times as large; a bias noise of Ξ = 0.25
+    Censoring at ±5 makes ARMSE1, 2, 3 {worse:.2g} times as large; a bias noise of Ξ = 0.25
     instead of 0.0025 makes them {calmer:.2g} times as large
     """
     worse, calmer = (
@@ -277,7 +277,7 @@ def _bound(theorem: int, end: str, bounds: Any) -> Any:
         return f"{', '.join(f'{share} ({name})' for share, name in parts)} of the steps"
 
     best = min(by_reading, key=lambda reading: by_reading[reading].sum())
-    text = f"as printed it fails in {steps('as printed')}"
+    text = f"As printed it fails in {steps('as printed')}"
     if best != "as printed":
         text += f"; of {len(by_reading)} readings *{best}* fails least, in {steps(best)}"
     text += " (each at the worse sensor)" * (theorem == 4)
@@ -307,7 +307,7 @@ def _difference(own: Any, other: Any) -> Any:
 def _satisfactory(piece: Any) -> Any:
     least, silent = (_ratio(piece, "aware", other)[2] for other in ("floor", "silent"))
     text = (
-        f"its mean over time is {least:.3g} times the smallest error of any filter (satisfactory: "
+        f"Its mean over time is {least:.3g} times the smallest error of any filter (satisfactory: "
         f"below {SATISFACTORY}), and {silent:.2g} times the error without measurements"
     )
     return by_mean(least < SATISFACTORY, piece.episodes), locals()
@@ -324,7 +324,7 @@ def _moves(rows: Any, sign: int) -> Any:
     chain = " → ".join(f"({number_text(row['paper']['mean'])})" for row in rows)
     medians = " → ".join(f"{row['paper']['median'][0]:.3g}" for row in rows)
     text = (
-        f"from row to row of the table, {(ours[:3] == 1).sum()} of 3 ARMSE of the paper's filter "
+        f"From row to row of the table, {(ours[:3] == 1).sum()} of 3 ARMSE of the paper's filter "
         f"move as claimed, beyond chance: {chain}; the median run's RMSE of x1 "
         f"{'does' if ours[3] == 1 else 'does not'}: {medians}. Of the assumed-density filter "
         f"{(other[:3] == 1).sum()} of 3 do"

@@ -93,7 +93,7 @@ class Bellman:
         return np.minimum(silent, request), silent - request
 
     def mean(self, law: Array, deviation: float, value: Array) -> Array:
-        """Return the mean values (S,) of an error's distribution ``law`` (M,), with the initial tokens.
+        """Return the mean values (S,) of a ``law`` (M,) of errors, with the initial tokens.
 
         Args:
             law: probabilities of the grid's points.

@@ -198,7 +198,7 @@ class SourceProblem:
         bucket: TokenBucket | None = None,
         initial: ArrayLike | None = None,
     ) -> SourceProblem:
-        """Return the checked problem, by default with unlimited tokens and the stationary distribution."""
+        """Return the checked problem, by default with unlimited tokens and a stationary channel."""
         matrix = validation.array("transition", transition, (None, None))
         if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
             raise validation.refusal("transition", matrix, "a square matrix whose rows sum to 1")

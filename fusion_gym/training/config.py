@@ -441,19 +441,3 @@ class Experiment(Strict):
         if training.get("timesteps") is not None:
             plain["training"]["many_sensors"] = None
         return checked(Experiment, plain, "config 'command line'")
-
-
-class ComparisonRow(Strict):
-    """One policy in one setting of the comparison's environment, or of another environment."""
-
-    label: str
-    policy: str
-    environment: str | None = None
-    options: Options = pydantic.Field(default_factory=dict)
-
-
-class SweepSettings(Strict):
-    """Settings and policies of one environment, row by row."""
-
-    environment: str
-    rows: tuple[ComparisonRow, ...] = pydantic.Field(min_length=1)

@@ -12,7 +12,6 @@ from hostile_folder import BROKEN, ENV
 
 from agents.benchmark.command import Benchmark
 from agents.papers.reproduce import Reproduce
-from agents.papers.table import Table
 from agents.zoo.zoo import Zoo
 from fusion_gym.commands import __main__ as fusion_gym_commands
 from fusion_gym.commands.command_line import OUTPUT_FOLDER, Command, OutputFile
@@ -20,7 +19,6 @@ from fusion_gym.commands.command_line import OUTPUT_FOLDER, Command, OutputFile
 RESEARCH: dict[str, type[Command]] = {
     "benchmark": Benchmark,
     "papers": Reproduce,
-    "table": Table,
     "zoo": Zoo,
 }
 EVERY = (*fusion_gym_commands.COMMANDS, *RESEARCH)
@@ -56,7 +54,6 @@ BASES: dict[str, dict[str, list[str]]] = {
     "field": {"log": ["log.csv"], "output": ["made"], "channels": ["a"], "share": ["0.5"]},
     "list": {"kinds": ["rules"]},
     "info": {"name": ["whittle"]},
-    "table": {"config": ["rows.yaml"], "episodes": ["2"]},
     "papers": {
         "papers": ["markov_jump"], "output": ["made"], "work": ["made_too"],
         "episodes": ["2"],

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,9 +21,8 @@ from training_configs import ENV, read_records, small_config
 import fusion_gym
 from fusion_gym.commands import demo
 from fusion_gym.evaluation.metrics import METRICS
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.training import run as train
-from fusion_gym.training.config import TABLE, Experiment, SweepSettings, load_checked
+from fusion_gym.training.config import TABLE, Experiment, load_checked
 from fusion_gym.validation import ConfigurationError
 
 CONFIGS = ROOT / "configs"
@@ -41,15 +39,6 @@ def test_committed_experiments_are_valid(path: Path) -> None:
     assert (task.options.action == "binary") == (binary or task.options.access == "single")
 
 
-@pytest.mark.usefixtures("unsearched")
-def test_committed_comparisons_name_policies_that_exist() -> None:
-    for file in CONFIGS.glob("*_reproduce.yaml"):
-        comparison = load_checked(SweepSettings, file)
-        for row in comparison.rows:
-            env_id = row.environment or comparison.environment
-            make_policy(row.policy, fusion_gym.make_task(env_id, **row.options))
-
-
 UNREADABLE = {
     "absent": (None, ["unreadable.yaml"]),
     "half": (b"a: [1,", ["not YAML"]),
@@ -61,13 +50,12 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("kind", [Experiment, SweepSettings])
 @pytest.mark.parametrize("name", UNREADABLE)
-def test_a_config_that_cannot_be_read(tmp_path: Path, name: str, kind: Any) -> None:
+def test_a_config_that_cannot_be_read(tmp_path: Path, name: str) -> None:
     path, (content, message) = tmp_path / "unreadable.yaml", UNREADABLE[name]
     if content is not None:
         path.write_bytes(content)
-    refused(lambda: load_checked(kind, path), *message)
+    refused(lambda: load_checked(Experiment, path), *message)
 
 
 def test_numbers_with_an_exponent_are_numbers(tmp_path: Path) -> None:

@@ -397,27 +397,19 @@ def test_commands_load_foreign_code_with_trust_alone(tmp_path: Path) -> None:
     model, _ = FOREIGN.build()
     policy = f"model:{tmp_path / 'model.zip'}"
     model.save(tmp_path / "model.zip")
-    files: dict[str, Any] = {
-        "config": {
-            "environment": {"id": ENV, "options": OPTIONS},
-            "algorithm": {"name": "ppo"},
-            "training": {"timesteps": 64},
-            "output": "unused",
-        },
-        "rows": {
-            "environment": ENV,
-            "rows": [{"label": "a", "policy": policy, "options": OPTIONS}],
-        },
+    content: dict[str, Any] = {
+        "environment": {"id": ENV, "options": OPTIONS},
+        "algorithm": {"name": "ppo"},
+        "training": {"timesteps": 64},
+        "output": "unused",
     }
-    for name, content in files.items():
-        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
     config = str(tmp_path / "config.yaml")
     compared = ["--config", config, "--policies", "never", policy]
     compared += ["--output", str(tmp_path / "comparison")]
     for command, arguments in (
         ("evaluate", ["--config", config, "--policies", policy]),
         ("compare", compared),
-        ("table", ["--config", str(tmp_path / "rows.yaml")]),
     ):
         words = [*arguments, "--episodes", "3"]
         assert "--trust" in refusal(command, words)

@@ -173,8 +173,8 @@ class UnknownInputOptions(PaperOptions):
     initial_covariance: ArrayLike | None = None
     """Covariance of x₀ that the filters assume, (n, n)."""
     initial_half_width: ArrayLike | None = None
-    """Half width of a uniform distribution of x₀ about its mean; without it x₀ is normal. The example's does
-    not hold beside a ``transition`` or an ``initial_mean``."""
+    """Half width of a uniform distribution of x₀ about its mean; without it x₀ is normal. The
+    example's does not hold beside a ``transition`` or an ``initial_mean``."""
     input_signal: Signal | ArrayLike = "sinusoids"
     """Unknown input. ``"steps"`` is a level that jumps with the probability 1/period,
     ``"random_walk"`` reverts to its mean with the correlation time period. An array
