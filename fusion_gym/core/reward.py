@@ -157,7 +157,7 @@ class RewardOptions(OptionGroup):
     """Weights of the states' squared errors in the reward, or a matrix W of eᵀWe. The default is
     the environment's own, which ``help`` shows. Explicit weights also weigh the trace that
     covariance intersection minimises, which is plain by default; a rule or a signal with such a
-    trace refuses a matrix."""
+    trace does not support a matrix."""
     reward_scale: float | Literal["auto"] | None = "auto"
     """Factor of the state weights. ``"auto"`` simulates requests at an even pace and takes the
     factor with which their error costs 1 per step; explicit ``state_weights`` are not scaled. The

@@ -45,7 +45,7 @@ class GymnasiumEnvironmentOptions(CommonOptions):
     termination forfeits the rewards of all steps that are left, so an episode costs horizon ·
     ``best_reward`` less the environment's return.
 
-    The states of live environments cannot branch: what simulates alternatives is refused.
+    Live environments cannot branch, so policies that simulate alternatives raise an error.
 
     Starting state: the environment's own reset; its seed follows from the seed of the episode.
 

@@ -30,7 +30,7 @@ class Fused:
 
     Args:
         mean: (n, N), NaN in a run without active estimates.
-        covariance: Claimed covariance (n, n, N).
+        covariance: Estimated covariance (n, n, N).
         find_gains: Function that computes the gains on first access.
         weights: (l, N), >= 0 with sum 1, of a rule that weighs covariances.
     """

@@ -66,7 +66,7 @@ class Recording:
         in brackets and its limits: ``humidity [%] 0..100``; unit and limits may be left
         out. A file with one row per reading has a column of times, of names and of values.
         Where columns such as ``room`` or ``id`` name devices, each has its own channels.
-        An empty cell, a word and an error code are no reading. Columns of words are left
+        An empty cell, text and an error code count as missing. Columns of text are left
         out. Times are rounded to multiples of the channels' median interval.
 
         Args:
@@ -76,7 +76,7 @@ class Recording:
                 of day and month.
             time_unit: unit of numeric times: ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, ``"min"``,
                 ``"h"``, ``"d"`` or ``"excel"``. By default the header names it.
-            error_codes: values that are no readings, beside those that are recognised.
+            error_codes: values that count as missing, beside the recognised ones.
             units: units of channels by name, in place of the units in the header.
 
         Raises:

@@ -74,7 +74,7 @@ class RemoteEstimationOptions(ControlOptions, PaperOptions):
     threshold of a random walk at a price of 5, or at the rate that the tokens allow."""
     filter: Annotated[str, _FILTERS, NumpyOnly("truncated")] = "symmetric"
     """Estimator of the centre. ``"symmetric"`` repeats its prediction in silence. ``"truncated"``
-    uses the silence of the policy ``trigger``; other policies are refused."""
+    uses the silence of the policy ``trigger``, and other policies raise an error."""
     trigger: Trigger | None = None
     """Policy whose silence ``filter="truncated"`` uses."""
     trigger_threshold: ArrayLike | None = None

@@ -131,8 +131,8 @@ class LinearFusionOptions(system.FeedbackOptions):
     assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
     is the Kalman filter for the policy ``stochastic_event``. ``"hold"`` is the state that fits the
     last delivered values best, weighted by their noises, without a filter. ``"truncated"`` is one
-    Kalman filter at the centre that uses the silence of the policy ``trigger``; other policies are
-    refused."""
+    Kalman filter at the centre that uses the silence of the policy ``trigger``, so that other
+    policies raise an error."""
     trigger: Trigger | None = None
     """Policy whose silence ``filter="truncated"`` uses."""
     trigger_threshold: ArrayLike | None = None
