@@ -13,14 +13,9 @@ from collections import ChainMap
 from pathlib import Path
 from typing import Any, cast
 
-from fusion_gym.core.access import ACCESS, AccessOptions
-from fusion_gym.core.action import ActionOptions
-from fusion_gym.core.channel import ChannelOptions
-from fusion_gym.core.knowledge import MEANING, ObservationOptions
-from fusion_gym.core.plant import TruthOptions
-from fusion_gym.core.reward import RewardOptions
-from fusion_gym.core.task import CommunicationOptions, Task
-from fusion_gym.core.token_bucket import BucketOptions
+from fusion_gym.core.access import ACCESS
+from fusion_gym.core.knowledge import MEANING
+from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import FOR_ALL, options_in, short
@@ -32,7 +27,6 @@ from fusion_gym.evaluation.metrics import metric_table
 from fusion_gym.fusion.table import RULES
 from fusion_gym.policies import registry
 from fusion_gym.policies.registry import parse_settings
-from fusion_gym.systems.linear_control import ControlOptions
 from fusion_gym.systems.tobit.system import FeedbackOptions
 from fusion_gym.training.config import algorithm_table
 
@@ -53,14 +47,11 @@ _PAPERS = {
     "unknown_input.md": (5, "unknown_input"),
 }  # by the page of an environment
 _LEGEND = "Only sensors know an entry with a star ([who knows what](concepts.md#who-knows-what))."
-# Options that several environments share, by the class that declares them.
+# Options that several environments share, by the class that declares them, bases first.
 _COMMON = {
     kind.__name__: {k: v for k, v in options_in(kind).items() if k in kind.__annotations__}
-    for kind in (
-        AccessOptions, BucketOptions, ChannelOptions, CommunicationOptions, ObservationOptions,
-        ActionOptions, RewardOptions, TruthOptions, ControlOptions, FeedbackOptions,
-    )
-} | {"FOR_ALL": FOR_ALL}  # fmt: skip
+    for kind in FeedbackOptions.__mro__[-3::-1]  # without OptionGroup and object
+} | {"FOR_ALL": FOR_ALL}
 
 
 def fact_table(env_id: str) -> str:
@@ -111,12 +102,9 @@ def option_table(text: str) -> str:
         cells = types.replace("'", '"'), usual.replace("'", '"'), plain_marks(option.meaning)
         rows.append((f"`{name}`", *cells))
     result = table(("option", "type", "default", "meaning"), rows)
-    others = ", ".join(changed)
-    return (
-        f"{result}\n\nOther defaults of [common options](options.md): {others}."
-        if others
-        else result
-    )
+    if changed:
+        result += f"\n\nOther defaults of [common options](options.md): {', '.join(changed)}."
+    return result
 
 
 def network_table(text: str) -> str:
