@@ -13,7 +13,7 @@ _SHOWN = 160  # characters of a value in a message
 
 
 class ConfigurationError(ValueError):
-    """Report a setting that cannot be used, in one line with its field, value and allowed values.
+    """Report a value that is not allowed, in one line with its field and the allowed values.
 
     Args:
         message: The message; line breaks become spaces.

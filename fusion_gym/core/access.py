@@ -74,9 +74,9 @@ ACCESS: dict[str, AccessRow] = {
         contended=True,
     ),
     "assignment": AccessRow(
-        "At most ``channels`` requests are granted, each on a channel of its own: in the order of "
-        "the queue each takes the free one of the highest probability of arrival, or the one that "
-        "the action assigns.",
+        "At most ``channels`` requests are granted, each on a channel of its own. In the order of "
+        "the queue each takes the free channel of the highest probability of arrival, unless the "
+        "action assigns one.",
         limited=True,
         by_channel=True,
     ),
@@ -100,7 +100,7 @@ class AccessOptions(OptionGroup):
     of the queue. With ``"single"`` the action space is ``Discrete(sensors + 1)``: 0
     is no request, m + 1 is sensor m."""
     slots: Annotated[int, Scaling(), Mark(validation.integer, at_least=1)] = 1
-    """Most grants in a step with ``access="slots"`` or ``"try_once_discard"``."""
+    """Largest number of grants per step with ``access="slots"`` or ``"try_once_discard"``."""
     discrepancy: Annotated[Literal["innovation", "held"], Scaling()] = "innovation"
     """Discrepancy of ``"try_once_discard"``: of the new measurement against its expectation
     (``"innovation"``) or the last delivered one (``"held"``)."""

@@ -55,8 +55,8 @@ class ChannelOptions(OptionGroup):
     draws."""
     acknowledgements: Annotated[Literal["perfect", "none"] | float | None, NumpyOnly()] = "perfect"
     """Whether a sensor learns that a packet arrives or is lost: always (``"perfect"``), never
-    (``"none"``), or with a probability. Otherwise it supposes an arrival: its ``held`` and ``age``
-    are of its last packet. The scheduler always knows."""
+    (``"none"``), or with a probability. Otherwise it assumes an arrival, so that its ``held``
+    and ``age`` refer to its last packet. The scheduler always knows."""
     delay: Annotated[ArrayLike, Scaling(), NumpyOnly()] = 0
     """Steps from a transmission to its arrival, at most 100: a whole number, or a pair (least,
     most) from which each packet draws uniformly, or a row (least, most) per sensor. The fusion

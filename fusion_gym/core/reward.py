@@ -156,14 +156,14 @@ class RewardOptions(OptionGroup):
     state_weights: ArrayLike | None = None
     """Weights of the states' squared errors in the reward, or a matrix W of eᵀWe. The default is
     the environment's own, which ``help`` shows. Explicit weights also weigh the trace that
-    covariance intersection minimises, which is plain by default; a rule or a signal with such a
-    trace does not support a matrix."""
+    covariance intersection minimises, which is unweighted by default; rules and signals with
+    such a trace do not support a matrix."""
     reward_scale: float | Literal["auto"] | None = "auto"
     """Factor of the state weights. ``"auto"`` simulates requests at an even pace and takes the
     factor with which their error costs 1 per step; explicit ``state_weights`` are not scaled. The
     pace is half of the sustained rate, or a quarter of all packets with unlimited tokens. These
     errors also scale the entries of ``belief_features``. ``None`` uses the error without
-    transmissions, and leaves the cost of a controller as it is, which the factor else multiplies as
+    transmissions, and does not scale a controller's cost, which the factor otherwise multiplies as
     well."""
 
     def own_weights(self, states: int) -> Array | None:

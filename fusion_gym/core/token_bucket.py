@@ -71,7 +71,7 @@ class BucketOptions(OptionGroup):
     """Rule by which simultaneous requests share the tokens. ``"equal"`` grants if ξ/l ≥ c for l
     sensors (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
     sensors while tokens last. ``"turns"`` grants in the order of a queue: a granted sensor goes to
-    its end, and a head that the tokens do not pay for blocks the sensors behind it."""
+    its end, and a request that the tokens do not pay for blocks the requests behind it."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,9 @@ class Option(NamedTuple):
 FOR_ALL = {
     "system": Option("str | None", None, "Path of a YAML file of options."),
     "max_episode_steps": Option(
-        "int | None", None, "Steps to truncation, without effect on scales."
+        "int | None",
+        None,
+        "Steps until truncation; unlike ``horizon`` it does not scale reward and observation.",
     ),
 }
 

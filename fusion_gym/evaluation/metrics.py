@@ -144,7 +144,7 @@ METRICS = {
     "peak_age": Metric("age of information just before an arrival", "lower", "sensor"),
     "age_95": Metric("95 % quantile of the age of information", "lower", "sensor"),
     "incorrect_age": Metric(
-        "age of incorrect information: steps since the weighted squared error was at most 1",
+        "age of incorrect information: steps since the weighted squared error was last at most 1",
         "lower",
     ),
     "denied": Metric("requests denied per step", "lower", column="denied"),
@@ -191,7 +191,7 @@ def metric_table(_: str) -> str:
         (f"`{name}`", metric.meaning, metric.axis or "mean, low, high", metric.better)
         for name, metric in METRICS.items()
     )
-    return table(("metric", "meaning", "a number for each", "better"), rows)
+    return table(("metric", "meaning", "one entry per", "better"), rows)
 
 
 def robust_summary(results: EpisodeResults) -> dict[str, float]:

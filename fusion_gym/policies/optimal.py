@@ -73,7 +73,7 @@ class OptimalPolicy(Stateless):
 
     @property
     def knowledge(self) -> Knowledge:
-        """The class of a sensor with thresholds, and of a scheduler with a table of two sources."""
+        """A sensor's knowledge class with thresholds, a scheduler's with a table of two sources."""
         return "own" if self.optimum.threshold is not None else "scheduler"
 
     def __call__(self, signals: Signals) -> Requests:

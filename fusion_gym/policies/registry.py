@@ -226,7 +226,7 @@ def make_policy(
 
 
 def make_policy(spec: str, env: Any, *, trust: bool = False, trial: bool = True) -> Any:
-    """Return the policy of a text for a task, or an agent that acts by it in an environment.
+    """Return the policy that a text names, for an environment as an agent with ``predict``.
 
     Parameters that the text does not set have the task's defaults (``task.policy_defaults``) or the
     maker's defaults.

@@ -493,7 +493,7 @@ class InnovationThreshold(LocalRule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """The class of a sensor, or with ``at_most``, which compares sensors, of a scheduler."""
+        """A sensor's knowledge class, or a scheduler's with ``at_most``, which compares sensors."""
         return "own" if self.at_most is None else "scheduler"
 
     def __call__(self, signals: Signals) -> Requests:
@@ -900,7 +900,7 @@ class BeliefRule(Rule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """The knowledge class, by the task's memory and by ``own``."""
+        """Depends on the task's memory and on ``own``."""
         return knows(self.task, self.own)
 
     def beliefs(self, signals: Signals) -> Beliefs:
@@ -1062,7 +1062,7 @@ class EstimateDifference(BeliefRule):
 
 @dataclass
 class KullbackLeibler(BeliefRule):
-    r"""Request where a packet's divergence of the centre's density is at least ``threshold`` nats.
+    r"""Request where a packet changes the centre's density by at least ``threshold`` nats.
 
     D(s) = ½ (tr P⁻¹ P_s - n + δᵀ P⁻¹ δ + ln det P - ln det P_s), with δ = x̂(s) - x̂, is the
     divergence from N(x̂(s), P_s) to N(x̂, P). The former is the centre's density after the packet of
@@ -1215,7 +1215,7 @@ class PricedThreshold(BeliefRule):
 
     @property
     def knowledge(self) -> Knowledge:
-        """The knowledge class, by the score, the task's memory and the comparison of sensors."""
+        """Depends on the score, the task's memory and the comparison of sensors."""
         if self.score == "innovation":
             return "scheduler" if self.margin != 1.0 or self.margin_exponent else "own"
         return "centre" if self.score == "variance" else super().knowledge

@@ -32,7 +32,7 @@ _HEAD = re.compile(
 
 @dataclass(frozen=True)
 class Recording:
-    """A log of sensors on even times.
+    """A log of sensors at equally spaced times.
 
     Args:
         values: readings (T, channels), with NaN where there is none; the index has the times.

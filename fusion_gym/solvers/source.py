@@ -154,7 +154,7 @@ _RESOLUTION_TOKENS = _RESOLUTION._replace(points=300)  # where tokens are limite
 
 @dataclass(frozen=True)
 class SourceProblem:
-    """The transmissions of one source with the least w e² + price · transmissions.
+    """The problem of one source: the least w e² + price · transmissions.
 
     A step starts from the error e and the channel state s of the previous step, both known. The
     source requests or not, and the channel moves to s'. A packet is lost with probability

@@ -28,7 +28,7 @@ class ControlOptions(OptionGroup):
     """B (n, inputs) of x(t+1) = A x(t) + B u(t) + w(t), which closes the loop: the input u = −L x̂
     acts from each delivery to the next sensing, and every node knows it."""
     control_weights: Sequence[ArrayLike] | None = None
-    """Pair (Q, R) of the cost xᵀQx + uᵀRu of a step: Q (n, n) positive semi-definite, R (inputs,
+    """Pair (Q, R) of the cost xᵀQx + uᵀRu per step: Q (n, n) positive semi-definite, R (inputs,
     inputs) positive definite. By default identities."""
     gain: ArrayLike | Literal["lqr"] = "lqr"
     """Gain L (inputs, n) of the controller. ``"lqr"`` is the linear quadratic regulator of

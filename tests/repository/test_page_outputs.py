@@ -1,4 +1,7 @@
-"""A block of text directly below Python on a page is what the Python prints."""
+"""A block of text directly below Python on a page is what the Python prints.
+
+A training ends in other weights on another machine, so its results are not compared.
+"""
 
 import contextlib
 import io
@@ -27,7 +30,8 @@ def outputs(path: Path) -> list[tuple[str, str]]:
             with contextlib.redirect_stdout(io.StringIO()) as printed:
                 exec(compile(block[2], f"{path.name} {place}", "exec"), names)
             below = blocks[place + 1] if place + 1 < len(blocks) else block
-            if below[1] == "text" and text[block.end() : below.start()] == "\n\n":
+            shown = below[1] == "text" and text[block.end() : below.start()] == "\n\n"
+            if shown and ".learn(" not in block[2]:
                 result.append((below[2], printed.getvalue()))
     return result
 

@@ -29,6 +29,7 @@ from fusion_gym.solvers.single import solve_finite
 from fusion_gym.solvers.source import ErrorGrid, SourceProblem
 from fusion_gym.validation import ConfigurationError
 
+TRUNCATED = {"filter": "truncated", "trigger": "send_on_delta", "trigger_threshold": 1.0}
 OSCILLATOR: dict[str, Any] = {"filter": "tobit", "random_start": True, "horizon": 20}
 TURN = [[0.8, -0.6], [0.6, 0.8]]
 
@@ -232,6 +233,8 @@ def test_coordinates_make_noise_and_curvature_diagonal() -> None:
     ("env", "options", "change", "message"),
     [
         ("TobitOscillator", {"filter": "paper"}, {}, "filter .*not allowed for the bound"),
+        ("LinearFusion", {"filter": "hold"}, {}, "filter .*not allowed for the bound"),
+        ("LinearFusion", TRUNCATED, {}, "filter .*not allowed for the bound"),
         ("BiasedOscillator", {"bias_aware": False}, {}, "bias_aware .*not allowed for the bound"),
         ("UnknownInput", {}, {}, "plant .*not allowed for the bound"),
         ("RemoteEstimation", {}, {}, "plant .*not allowed for the bound"),

@@ -92,8 +92,8 @@ def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
     if problem is None:
         raise validation.ConfigurationError(
             f"plant = {type(task.plant).__name__} is not allowed for the bound: the centre must "
-            "estimate a linear plant from all measurements, as in TobitOscillator and the biased "
-            "systems"
+            "estimate a linear plant from all measurements, as in TobitOscillator, LinearFusion "
+            "and the biased systems"
         )
     transition, size = problem.transition, len(problem.transition)
     weight = validation.positive("weights", np.ones(size) if weights is None else weights, (size,))

@@ -254,11 +254,11 @@ class CensoredEstimator(
         plant.nature.refuse(where)
         for part in (dynamics, sensors):
             part.refuse_schedule(where)
-        if not self.centre.predicts:
+        if not self.centre.predicts or self.reads_silence:
             raise ConfigurationError(
                 f"filter is not allowed {where}: in silence the centre must predict, so neither "
-                "hold the last value (filter='paper' with silent='hold') nor use the information "
-                "of silence (filter='stochastic')"
+                "hold the last value (filter='hold', or 'paper' with silent='hold') nor use the "
+                "information of silence (filter='stochastic' or 'truncated')"
             )
         motion = dynamics.transition, dynamics.process_covariance, dynamics.initial_covariance
         both = sensors.stacked_matrix, sensors.noise_covariance
