@@ -176,18 +176,19 @@ def headline_text(settings: Sequence[Setting], results: Results) -> str:
         for kind in kinds[:4]
     )
     printed, thresholds, rule, informed = medians
+    published = f"the parameters as printed cost {-printed:.0f} % more than tuned ones, "
+    scheduled = "; if a scheduler sees the measurements of all sensors, the rule saves "
     gains = [-row.difference for row in results.classes if row.kind == "learned"]
     text = (
         "Cost that a policy saves against the task's trigger, whose parameters are tuned with as "
         "many episodes as the searched rule: %, with a 95 % bootstrap interval over seeds and "
         "episodes. Each entry is the mean over five prices, at equal knowledge.\n\n"
-        f"In the median task, the parameters as printed cost {-printed:.0f} % more than tuned "
-        f"ones. One threshold per sensor saves {thresholds:.0f} % of the tuned trigger's cost and "
-        f"the searched rule {rule:.0f} %; if a scheduler sees the measurements of all sensors, the "
-        f"rule saves {informed:.0f} %. A learned policy costs "
-        f"{100.0 * float(np.median(gains or [np.nan])):.1f} % less than the best tuned rule in the "
-        f"median of {len(gains)} combinations of task and knowledge class, and at most "
-        f"{100.0 * max(gains, default=np.nan):.1f} % less. At "
+        f"In the median task, {'' if math.isnan(printed) else published}one threshold per sensor "
+        f"saves {thresholds:.0f} % of the tuned trigger's cost, and the searched rule {rule:.0f} %"
+        f"{'' if math.isnan(informed) else f'{scheduled}{informed:.0f} %'}. A learned policy costs "
+        f"{100.0 * float(np.median(gains or [np.nan])) + 0.0:.1f} % less than the best tuned rule "
+        f"in the median of {len(gains)} combinations of task and knowledge class, and at most "
+        f"{100.0 * max(gains, default=np.nan) + 0.0:.1f} % less. At "
         f"{sum(row.rule_points for row in every)} of {len(every) * shares} points it is that rule, "
         "because no agent beat it in tuning."
     )
