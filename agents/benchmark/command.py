@@ -1,14 +1,14 @@
-r"""The benchmark: rules and agents of three classes in eight settings, at equal price.
+r"""The benchmark: rules and agents of three knowledge classes in eight tasks.
 
     python -m agents.benchmark --quick --workers 2
     python -m agents.benchmark --suite channels
     python -m agents.benchmark --class scheduler \
         --policy 'value_of_information:price={price}'
 
-At five prices of every class it tunes the rules of the literature, searches one rule for all
+At five prices per knowledge class it tunes the rules of the literature, searches one rule for all
 prices, trains agents, and compares all of them on the same test episodes. Into the results folder
 go the tables, a figure per setting and ``README.md``. With ``--policy`` your own policy is compared
-with the best rule of a class; ``{price}`` in its text stands for the price.
+with the best rule of its class; ``{price}`` in its text stands for the price.
 
 Finished pieces of work stay in the work folder, under a hash of their inputs and of the code, and
 the same command goes on with the others. They hold pickles.
@@ -34,20 +34,20 @@ from fusion_gym.validation import refusal
 
 @dataclass(frozen=True)
 class Benchmark(Long):
-    """The benchmark: rules and agents of three classes in eight settings, at equal price."""
+    """The benchmark: rules and agents of three knowledge classes in eight tasks."""
 
     program = "python -m agents.benchmark"
 
     suite: SuiteName = "settings"
-    """Eight settings, or two with channels and batteries."""
+    """Eight tasks, or two with channels and batteries."""
     settings: tuple[str, ...] = ()
-    """Settings by name; all by default."""
+    """Tasks by name; all by default."""
     quick: bool = False
-    """Run a small benchmark of three settings and one seed, in minutes."""
+    """Run a small benchmark of three tasks and one seed, in minutes."""
     policy: str | None = None
     """Only compare this policy with the best tuned rule."""
     class_name: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
-    """Class of the policy."""
+    """Knowledge class of the policy."""
     results: Annotated[Path | None, OUTPUT_FOLDER] = None
     """Folder for tables, figures and README.md: results, results/channels, or with --quick
     runs/benchmark/quick/results."""

@@ -216,18 +216,10 @@ def class_table(titles: dict[str, str], results: Results) -> str:
         rule = f"{sum(row.rule_points for row in own)} of {len(own) * shares}"
         lines.append((titles[place[0]], TITLES[place[1]], algorithms, *cells, limit, rule))
     heads = (
-        *(
-            "task",
-            "knowledge class",
-            "trained by",
-            "learned policy",
-            "agents alone",
-            "searched rule",
-        ),
-        *("one threshold", "a threshold per sensor", "tuned trigger", "optimum or bound"),
-        "points with a rule",
+        "task, knowledge class, trained by, learned policy, agents alone, searched rule, "
+        "one threshold, a threshold per sensor, tuned trigger, optimum or bound, points with a rule"
     )
-    return table(heads, lines)
+    return table(tuple(heads.split(", ")), lines)
 
 
 def mean_text(row: evidence.ClassRow | None) -> str:
@@ -343,11 +335,11 @@ def draw_class(panel: Axes, rows: Sequence[evidence.TestRow]) -> dict[str, Line2
 
 
 def print_classes(rows: Sequence[evidence.ClassRow], points: Sequence[evidence.PointRow]) -> None:
-    """Print the mean differences to the searched rule, and the difference at each price."""
+    """Print the mean differences to the best rule, and the difference at each price."""
     places = ["setting", "name", "kind"]
     each = pd.DataFrame(points).pivot(index=places, columns="share", values="difference")
     each = each[each.columns[::-1]].map(signed_percent).rename(columns="{:.0%}".format)
     means = {(row.setting, row.name, row.kind): mean_text(row) for row in rows}
     result = pd.Series(means, name="all prices").rename_axis(places).to_frame().join(each)
-    print("cost over the searched rule's, %; negative: cheaper")
+    print("cost relative to the best rule, %; negative: cheaper")
     print(result.fillna("–").to_string())

@@ -31,7 +31,7 @@ class Zoo(Long):
     program = "python -m agents.zoo"
 
     settings: tuple[str, ...] = ()
-    """Settings by name; all by default."""
+    """Tasks by name; all by default."""
     work: Annotated[Path, OUTPUT_FOLDER] = Path("runs/benchmark")
     """Folder of the benchmark's finished pieces and agents."""
     zoo: Annotated[Path, OUTPUT_FOLDER] = Path(zoo.__file__).parent
