@@ -199,7 +199,7 @@ def _(theorems: Any) -> Any:
     (42) holds in {shares[0]:%} of the steps in which a node receives and in {shares[1]:%} of the
     others, where its left side is at least {least:.2f}: the theorem does not apply. The error
     still stays bounded: squared error {first} in steps 201 to 400 and {last} in the last 200 of
-    1000. Without transmissions the bound grows by a factor of {growth:.2f} a step.
+    1000. Without transmissions the bound grows by a factor of {growth:.2f} per step.
     """
     delivered, silent = theorems.holds_delivered, theorems.holds_silent
     (_, first, *_, last), (_, early, *_, late) = theorems.windows, theorems.traces
