@@ -7,7 +7,7 @@ r"""The benchmark: rules and agents of three knowledge classes in eight tasks.
 
 At five prices per knowledge class it tunes the rules of the literature, searches one rule for all
 prices, trains agents, and compares all of them on the same test episodes. Into the results folder
-go the tables, a figure per setting and ``README.md``. With ``--policy`` your own policy is compared
+go the tables, a figure per task and ``README.md``. With ``--policy`` your own policy is compared
 with the best rule of its class; ``{price}`` in its text stands for the price.
 
 Finished pieces of work stay in the work folder, under a hash of their inputs and of the code, and

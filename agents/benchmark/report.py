@@ -190,7 +190,7 @@ def headline_text(settings: Sequence[Setting], results: Results) -> str:
         f"in the median of {len(gains)} combinations of task and knowledge class, and at most "
         f"{100.0 * max(gains, default=np.nan) + 0.0:.1f} % less. At "
         f"{sum(row.rule_points for row in every)} of {len(every) * shares} points it is that rule, "
-        "because no agent beat it in tuning."
+        "because no agent was clearly cheaper in tuning."
     )
     labels = [STYLES[kind].label for kind in kinds[:-1]]
     heads: Sequence[str] = ("task", "tuned trigger, its knowledge class", *labels)

@@ -286,15 +286,16 @@ def read_command(kind: type[_Kind]) -> _Kind:
     except SystemExit as end:
         if end.code:
             print(f"error: {_essence(output.getvalue())}", file=sys.stderr)
-        print(_fold(re.sub(r"\n{3,}", "\n\n", printed.getvalue())), end="")
+        text = printed.getvalue()  # the help, or a script that completes words in a shell
+        print(_fold(text) if text.startswith("usage: ") else text, end="")
         flush()
         raise
 
 
 def _fold(text: str) -> str:
-    """Return text with its paragraphs in lines of 80 characters; a space begins another line."""
+    """Return help with its paragraphs in lines of 80 characters; a space begins another line."""
     wrapper = textwrap.TextWrapper(_WIDTH, break_long_words=False, break_on_hyphens=False)
-    lines = (line.rstrip() for line in text.split("\n"))
+    lines = (line.rstrip() for line in re.sub(r"\n{3,}", "\n\n", text).split("\n"))
     return "\n".join(line if line[:1] in ("", " ") else wrapper.fill(line) for line in lines)
 
 

@@ -180,8 +180,8 @@ class GymnasiumSystem(NonlinearSystem):
         return actions.T
 
     def move(self, state: Array, noise: Array) -> Array:
-        """Not defined: the environment itself moves."""
-        raise NotImplementedError
+        """Raise an error, because the environment itself moves."""
+        raise NotImplementedError("the environment itself moves")
 
     def measure(self, state: Array, noise: Array) -> Array:
         """Return the entries of each sensor, zero where others have more."""

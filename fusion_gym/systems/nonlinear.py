@@ -169,8 +169,11 @@ class NonlinearSystem(ABC):
 
         Args:
             mean: estimate (n, N).
+
+        Raises:
+            NotImplementedError: the class does not define it.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} does not define 'control'")
 
     def cost(self, state: Array, control: Array) -> Array:
         """Return the cost (N,) >= 0 of a step; only with ``inputs``.
@@ -178,8 +181,11 @@ class NonlinearSystem(ABC):
         Args:
             state: true state (n, N).
             control: input (k, N).
+
+        Raises:
+            NotImplementedError: the class does not define it.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} does not define 'cost'")
 
     def terminated(self, state: Array) -> NDArray[np.bool_] | None:
         """Return the runs (N,), bool, that end here, as a fall does; ``None`` is none.

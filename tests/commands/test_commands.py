@@ -71,6 +71,14 @@ def test_help_shows_every_option(
         command_line.read_command(PROGRAMS[owner])
 
 
+def test_a_script_of_completions_keeps_its_lines() -> None:
+    words = [sys.executable, "-m", "fusion_gym.commands", "list", "--tyro-print-completion", "bash"]
+    script = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert "complete" in script
+    assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
+    assert max(map(len, script.splitlines())) > 80
+
+
 def test_info_takes_every_spelling_of_the_pages() -> None:
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     text = "".join(page.read_text() for page in pages)
