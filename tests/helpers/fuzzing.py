@@ -15,7 +15,7 @@ import types
 import typing
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
 
@@ -172,9 +172,10 @@ def flaw(env_id: str, settings: Options, seed: int = 0) -> str | None:
     Right is one line that names a given option, or finite steps, both within the time limit and
     without a warning.
     """
+    extreme = _is_extreme(env_id, settings)
     with _time_limit(), warnings.catch_warnings():
         warnings.simplefilter("error")
-        for deliberate in (*DELIBERATE, *[_ROUNDING] * _is_extreme(env_id, settings)):
+        for deliberate in (*DELIBERATE, *[_ROUNDING] * extreme):
             warnings.filterwarnings("ignore", deliberate)
         try:
             env: VectorEnv[Any, Any, Any] = gymnasium.make_vec(
@@ -191,15 +192,11 @@ def flaw(env_id: str, settings: Options, seed: int = 0) -> str | None:
 
 
 def _is_extreme(env_id: str, settings: Options) -> bool:
-    """Whether numbers of an option are a million times its default's, or a millionth."""
+    """Whether a number among the options is a million times its default, or a millionth."""
     default = options_of(env_id)()
-    for name, value in settings.items():
-        with suppress(TypeError, ValueError):
-            own, usual = (np.abs(np.asarray(v, float)) for v in (value, getattr(default, name)))
-            ratio = own[own > 0.0].min() / usual[usual > 0.0].max()
-            if not 1e-6 < ratio < 1e6:
-                return True
-    return False
+    pairs = ((value, getattr(default, name)) for name, value in settings.items())
+    plain = [(a, b) for a, b in pairs if {type(a), type(b)} <= {int, float}]
+    return any(not 1e-6 * abs(b) <= abs(a) <= 1e6 * abs(b) for a, b in plain)
 
 
 def _misleading(message: str, settings: Options) -> str | None:
